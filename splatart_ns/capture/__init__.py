@@ -1,0 +1,1 @@
+"""What is read: states, frames, labels, masks."""

@@ -2,13 +2,44 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from splatart_ns.errors import InputError
+
 UNLABELLED = 255
 """The label of a pixel that nobody labelled."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is wrong with a capture, where, and how to mend it."""
+
+    severity: str
+    """"error": it cannot be fitted so; "warning": it can, and somebody should know."""
+    file: Path
+    message: str
+    """What was found."""
+    mend: str
+    """What to do about it."""
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.message}; {self.mend}"
+
+
+class CaptureError(InputError):
+    """An error in a capture, with its parts kept apart for a list of problems."""
+
+    def __init__(self, file: Path, message: str, mend: str) -> None:
+        self.problem = Problem("error", file, message, mend)
+        super().__init__(f"{self.problem}.")
+
+
+Report = Callable[[Problem], None]
+"""Takes one problem; it raises, or notes the problem and lets the reader go on."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +58,23 @@ class Camera:
     @property
     def distorted(self) -> bool:
         return any(d != 0.0 for d in self.distortion)
+
+    @property
+    def K(self) -> np.ndarray:
+        """The intrinsic matrix [3, 3] float64."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def downscaled(self, factor: int) -> Camera:
+        """The camera of the image whose pixels are means of factor x factor pixels; what remains is cut off."""
+        return replace(
+            self,
+            fx=self.fx / factor,
+            fy=self.fy / factor,
+            cx=self.cx / factor,
+            cy=self.cy / factor,
+            width=self.width // factor,
+            height=self.height // factor,
+        )
 
 
 @dataclass(frozen=True)
@@ -82,6 +130,30 @@ class Normalization:
     centre: np.ndarray
     """[3] float64, in the capture's unit."""
     scale: float
+
+    @staticmethod
+    def from_cameras(T_world_camera: np.ndarray, half_fov: np.ndarray) -> Normalization:
+        """The centre that all optical axes pass nearest to, at the scale at which the images' half width there is 1.
+
+        So an object that fills the images has a radius of about 1. `T_world_camera` [N, 4, 4] are OpenGL poses,
+        `half_fov` [N] the half of the smaller field of view, in radians. The centre is the least-squares solution of
+        sum (I - d d^T) (x - c) = 0 over the axes (c, d). Where the axes are parallel, or cross behind the cameras, it
+        lies before the cameras' mean, as far away as the cameras are apart.
+        """
+        c, d = T_world_camera[:, :3, 3], -T_world_camera[:, :3, 2]
+        mean = c.mean(axis=0)
+        across = np.eye(3) - d[:, :, None] * d[:, None, :]
+        A = across.mean(axis=0)
+        depth = np.zeros(len(c))
+        if np.linalg.eigvalsh(A)[0] > 1e-4:  # about half a degree between the axes
+            centre = mean + np.linalg.solve(A, np.einsum("nij,nj->i", across, c - mean) / len(c))
+            depth = np.einsum("ni,ni->n", centre - c, d)
+        if np.median(depth) <= 0:
+            forward = d.mean(axis=0)
+            forward = forward / max(np.linalg.norm(forward), 1e-9)
+            distance = np.linalg.norm(c - mean, axis=1).max() or 1.0
+            centre, depth = mean + distance * forward, np.full(len(c), distance)
+        return Normalization(centre, float(1.0 / np.median((depth * np.tan(half_fov))[depth > 0])))
 
     def camera_to_normal(self, T_world_camera: np.ndarray) -> np.ndarray:
         """A camera pose [..., 4, 4] in the normalised world."""

@@ -63,9 +63,7 @@ class Splat:
 
     def map(self, function) -> Splat:
         """Apply `function` to every tensor."""
-        return replace(
-            self, **{f.name: function(v) for f in fields(self) if (v := getattr(self, f.name)) is not None}
-        )
+        return replace(self, **{f.name: function(v) for f in fields(self) if (v := getattr(self, f.name)) is not None})
 
     def to(self, *args) -> Splat:
         return self.map(lambda t: t.to(*args))

@@ -1,0 +1,97 @@
+"""The result: parts with their Gaussians and motions, joints, and the kinematic tree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+from splatart_ns.splats.splat import Splat
+
+JOINT_DOFS = {"revolute": 1, "prismatic": 1, "screw": 1, "cylindrical": 2, "spherical": 3, "fixed": 0, "free": 6}
+"""Degrees of freedom by joint type."""
+
+
+@dataclass
+class Part:
+    """A rigid body of the object."""
+
+    id: int
+    """The label id, 1 or more."""
+    name: str
+    splat: Splat
+    """Gaussians in the canonical frame (the world at state 0), in the input cameras' unit."""
+    motion: Tensor
+    """T[state]: canonical to that state [S, 4, 4] float64; the first is the identity."""
+    motion_covariance: Tensor
+    """Covariance of each motion's tangent (translation, rotation) [S, 6, 6]; NaN where undetermined."""
+
+
+@dataclass
+class Joint:
+    """A joint between two parts; axis and origin are in the canonical frame."""
+
+    name: str
+    type: str
+    """A key of `JOINT_DOFS`."""
+    parent: str
+    child: str
+    axis: Tensor
+    """Unit axis [3] float64."""
+    origin: Tensor
+    """A point on the axis [3] float64."""
+    values: Tensor
+    """Per state [S], radian (revolute, screw) or length (prismatic), 0 at state 0; [S, D] for D = 2, 3 or 6 degrees
+    of freedom: (length, angle) for cylindrical, a rotation vector for spherical, a tangent (translation, rotation)
+    for free. Zeros for fixed."""
+    limits: tuple[float, float] | None
+    """The observed range of the value; None for types with more than one degree of freedom."""
+    pitch: float = 0.0
+    """Length per radian; 0 but for screws."""
+    in_tree: bool = True
+    residual: float = 0.0
+    """Mean distance of the child's points between the observed motion and the joint's, length."""
+    covariance: dict[str, Any] = field(default_factory=dict)
+    """Named covariances of the joint's parameters as nested lists; None where undetermined."""
+    ambiguous: bool = False
+    alternatives: list[dict[str, Any]] = field(default_factory=list)
+    """Other types that were tried: {"type", "residual", "score"}."""
+
+
+@dataclass
+class Bundle:
+    """What `splatart fit` leaves: DESIGN section 5, with the Gaussians loaded."""
+
+    parts: list[Part]
+    """In order of id."""
+    joints: list[Joint]
+    """All accepted joints; those with `in_tree` form a tree whose root is `root`, the rest close loops."""
+    root: str
+    states: list[str]
+    length_unit: str = "unknown"
+    loops: list[dict[str, Any]] = field(default_factory=list)
+    """Loop closures: {"joint": name, "parts": [names around the loop]}."""
+    provenance: dict[str, Any] = field(default_factory=dict)
+    """{"version", "seed", "settings"}."""
+
+    @property
+    def part_names(self) -> list[str]:
+        return [part.name for part in self.parts]
+
+    def part(self, name: str) -> Part:
+        return next(part for part in self.parts if part.name == name)
+
+    @property
+    def tree_joints(self) -> list[Joint]:
+        """The tree's joints, parents before children."""
+        of_parent: dict[str, list[Joint]] = {}
+        for joint in self.joints:
+            if joint.in_tree:
+                of_parent.setdefault(joint.parent, []).append(joint)
+        ordered, open_parts = [], [self.root]
+        while open_parts:
+            joints = of_parent.pop(open_parts.pop(0), [])
+            ordered += joints
+            open_parts += [joint.child for joint in joints]
+        return ordered

@@ -1,0 +1,350 @@
+"""The layouts of a capture on disk: state folders, one transforms.json with states, PARIS."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatart_ns.capture.capture import (
+    UNLABELLED,
+    Capture,
+    CaptureError,
+    Frame,
+    Normalization,
+    Problem,
+    Report,
+    State,
+)
+from splatart_ns.capture.images import MAX_LABEL, image_size, read_labels
+from splatart_ns.capture.values import parse_camera, parse_matrix, parse_pose, read_json, relative_path, show
+
+SPLITS = ("train", "val", "test")
+_PARIS_STATES = ("start", "end")
+
+
+def load_capture(path: Path | str) -> Capture:
+    """Read a capture's structure: states, frames, cameras, splits, part names. No image is decoded but label files
+    where `semantic_classes` does not name the parts.
+
+    `path` is a folder in one of three layouts, recognised by its files:
+
+    - subfolders with a `transforms.json` each, one a state, in natural order of their names (`eval` is none);
+    - one `transforms.json` whose frames carry `"state": k`;
+    - PARIS: `start/` and `end/` with `{train,val,test}/NNNN.png`, `camera_{train,val,test}.json` and optionally
+      `{train,val,test}_semantics/NNNN.png`.
+
+    `train_filenames`, `val_filenames` and `test_filenames` are honoured: a frame that none of them lists is left out,
+    one in several counts as train before test before val. Without any of the lists every 8th frame of a state, in
+    order of the names, is a test frame. A frame's own intrinsics come before those of the file. A frame without
+    `w` and `h` has the size of its image.
+
+    Part names are made fit for file names. Without `semantic_classes` they are `part_1`, `part_2`, ... up to the
+    largest id in the label files.
+
+    Raises `InputError` at the first thing that cannot be read.
+    """
+    return read_capture(path, _raise)
+
+
+def load_novel(path: Path | str) -> tuple[State, ...]:
+    """The held-out configurations `eval/novel_NN` of a capture, for evaluation only; () where there are none.
+
+    Raises `InputError` as `load_capture` does.
+    """
+    folders = _subfolders(Path(path) / "eval")
+    return tuple(_read_state(folder, _raise)[0] for folder in folders if folder.name.startswith("novel"))
+
+
+def read_capture(path: Path | str, report: Report) -> Capture:
+    """`load_capture`, telling `report` of every problem and leaving out what it concerns.
+
+    Raises `InputError` where nothing useful is left.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise CaptureError(path, "the capture is not a folder", "give the folder that holds the states")
+    folders = [f for f in _subfolders(path) if f.name != "eval"]
+    single = os.path.isfile(path / "transforms.json")
+    if folders and single:
+        raise CaptureError(
+            path,
+            f"there is a transforms.json both here and in {folders[0].name}",
+            'keep either the state folders, or one file whose frames carry "state"',
+        )
+    if folders:
+        states, metas = _read_folders(folders, report)
+    elif single:
+        states, metas = _read_single(path / "transforms.json", report)
+    elif all(os.path.isfile(path / state / "camera_train.json") for state in _PARIS_STATES):
+        states, metas = [_read_paris(path / state, report) for state in _PARIS_STATES], []
+    else:
+        raise CaptureError(
+            path,
+            "there is no capture here",
+            "expected are subfolders with a transforms.json each, one transforms.json, or PARIS's start/ and end/ with "
+            "their camera_train.json",
+        )
+    states = [state for state in states if state.frames]
+    if not states:
+        raise CaptureError(path, "no frame of the capture can be used", "mend the frames' entries")
+    frames = [frame for state in states for frame in state.frames]
+    return Capture(
+        path=path,
+        states=tuple(states),
+        parts=_part_names(metas, frames, report),
+        length_unit=next((unit for _, m in metas if isinstance(unit := m.get("length_unit"), str)), "unknown"),
+        normalization=Normalization.from_cameras(
+            np.stack([f.T_world_camera for f in frames]),
+            np.array([math.atan(min(c.width / c.fx, c.height / c.fy) / 2) for c in (f.camera for f in frames)]),
+        ),
+    )
+
+
+# ---------------------------------------------------------------------------------------------- layouts
+
+
+def _subfolders(path: Path) -> list[Path]:
+    """The folders in `path` that hold a transforms.json, in natural order: state_2 before state_10."""
+    if not path.is_dir():
+        return []
+    found = [f for f in path.iterdir() if not f.name.startswith(".") and os.path.isfile(f / "transforms.json")]
+    # Digits, and only they, are at the odd places of the split, so numbers meet numbers.
+    return sorted(found, key=lambda f: [int(s) if i % 2 else s for i, s in enumerate(re.split(r"(\d+)", f.name))])
+
+
+_Meta = tuple[Path, dict[str, Any]]
+
+
+def _read_folders(folders: Sequence[Path], report: Report) -> tuple[list[State], list[_Meta]]:
+    states, metas = [], []
+    for folder in folders:
+        try:
+            state, meta = _read_state(folder, report)
+        except CaptureError as error:
+            report(error.problem)
+            continue
+        states.append(state)
+        metas.append(meta)
+    return states, metas
+
+
+def _read_state(folder: Path, report: Report) -> tuple[State, _Meta]:
+    file = folder / "transforms.json"
+    meta = read_json(file)
+    (frames,) = _read_frames(file, meta, {0: _entries(file, meta)}, report).values()
+    return State(folder.name, frames, _points(file, meta)), (file, meta)
+
+
+def _read_single(file: Path, report: Report) -> tuple[list[State], list[_Meta]]:
+    meta = read_json(file)
+    groups: dict[int, list[Any]] = {}
+    for i, entry in enumerate(_entries(file, meta)):
+        k = entry.get("state") if isinstance(entry, dict) else None
+        if isinstance(k, bool) or not isinstance(k, int) or not 0 <= k < 10_000:
+            found = f"has the state {show(k)}" if k is not None else 'carries no "state"'
+            report(Problem("error", file, f"frame {i} {found}", 'give every frame "state": 0, 1, ... as a number'))
+            continue
+        groups.setdefault(k, []).append(entry)
+    points = _points(file, meta)
+    frames = _read_frames(file, meta, dict(sorted(groups.items())), report)
+    return [State(f"state_{k:02d}", f, points) for k, f in frames.items()], [(file, meta)]
+
+
+def _read_paris(folder: Path, report: Report) -> State:
+    frames: list[Frame] = []
+    for split in SPLITS:
+        file = folder / f"camera_{split}.json"
+        if not os.path.isfile(file):
+            continue
+        try:
+            cameras = read_json(file)
+            K = parse_matrix(file, "K", cameras.get("K"), ((3, 3), (4, 4)))
+        except CaptureError as error:
+            report(error.problem)
+            continue
+        for name, pose in sorted(cameras.items()):
+            if name == "K":
+                continue
+            try:
+                frames.append(_paris_frame(file, split, name, pose, K))
+            except CaptureError as error:
+                report(error.problem)
+    return State(folder.name, tuple(frames))
+
+
+def _paris_frame(file: Path, split: str, name: str, pose: Any, K: np.ndarray) -> Frame:
+    image = file.parent / relative_path(file, "an image name", f"{split}/{name}.png")
+    labels = file.parent / f"{split}_semantics/{name}.png"
+    width, height = image_size(image)
+    values = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": width, "h": height}
+    return Frame(
+        name=f"{split}/{name}.png",
+        image=image,
+        camera=parse_camera(file, f"image {name!r}", {k: float(v) for k, v in values.items()}, image),
+        T_world_camera=parse_pose(file, f"image {name!r}", pose),
+        split=split,
+        labels=labels if os.path.isfile(labels) else None,
+    )
+
+
+# ---------------------------------------------------------------------------------------------- transforms.json
+
+
+def _entries(file: Path, meta: dict[str, Any]) -> list[Any]:
+    entries = meta.get("frames")
+    if not isinstance(entries, list) or not entries:
+        found = "is empty" if entries == [] else f"is {show(entries)}" if "frames" in meta else "is missing"
+        raise CaptureError(file, f'"frames" {found}', "list at least one frame with file_path and transform_matrix")
+    return entries
+
+
+def _read_frames(
+    file: Path, meta: dict[str, Any], groups: dict[int, list[Any]], report: Report
+) -> dict[int, tuple[Frame, ...]]:
+    """The frames of each group of entries, sorted by name; entries that cannot be read are reported and left out."""
+    named: dict[int, list[tuple[str, dict[str, Any]]]] = {}
+    for k, entries in groups.items():
+        named[k] = []
+        for i, entry in enumerate(entries):
+            try:
+                if not isinstance(entry, dict):
+                    raise CaptureError(file, f"frame {i} is {show(entry)}", "write it as an object with file_path")
+                named[k].append((relative_path(file, f"file_path of frame {i}", entry.get("file_path")), entry))
+            except CaptureError as error:
+                report(error.problem)
+        named[k].sort(key=lambda pair: pair[0])
+    splits = _splits(file, meta, [[name for name, _ in pairs] for pairs in named.values()], report)
+    frames: dict[int, tuple[Frame, ...]] = {}
+    for k, pairs in named.items():
+        read = []
+        for name, entry in pairs:
+            try:
+                if name in splits:
+                    read.append(_frame(file, name, {**meta, **entry}, splits[name]))
+            except CaptureError as error:
+                report(error.problem)
+        frames[k] = tuple(read)
+    return frames
+
+
+def _frame(file: Path, name: str, values: dict[str, Any], split: str) -> Frame:
+    def optional(key: str) -> Path | None:
+        value = values.get(key)
+        return None if value is None else file.parent / relative_path(file, f"{key} of frame {name!r}", value)
+
+    owner, image = f"frame {name!r}", file.parent / name
+    return Frame(
+        name=name,
+        image=image,
+        camera=parse_camera(file, owner, values, image),
+        T_world_camera=parse_pose(file, owner, values.get("transform_matrix")),
+        split=split,
+        labels=optional("semantics_path"),
+        object_mask=optional("object_mask_path"),
+        mask=optional("mask_path"),
+        depth=optional("depth_file_path"),
+    )
+
+
+def _splits(file: Path, meta: dict[str, Any], groups: Sequence[Sequence[str]], report: Report) -> dict[str, str]:
+    """The split of every frame that is used, by name; `groups` are the states' frame names, sorted."""
+    if not any(f"{split}_filenames" in meta for split in SPLITS):
+        return {name: "test" if i % 8 == 7 else "train" for names in groups for i, name in enumerate(names)}
+    names = {name for group in groups for name in group}
+    listed: dict[str, set[str]] = {}
+    for split in SPLITS:
+        key = f"{split}_filenames"
+        values = meta.get(key)
+        if values is not None and not isinstance(values, list):
+            raise CaptureError(file, f"{key} is {show(values)}", "write it as a list of file paths")
+        listed[split] = {relative_path(file, f"an entry of {key}", value) for value in values or []}
+        if unknown := sorted(listed[split] - names):
+            message = f"{key} lists {unknown[0]!r}, which no frame has as its file_path"
+            report(Problem("error", file, message, "correct the name or add the frame"))
+    if both := sorted(listed["train"] & (listed["val"] | listed["test"])):
+        message = f"{both[0]!r} is a training frame and a test frame at once"
+        report(Problem("warning", file, message, "take it out of test_filenames; it counts as a training frame"))
+    return {name: split for split in ("val", "test", "train") for name in listed[split] & names}
+
+
+def _points(file: Path, meta: dict[str, Any]) -> Path | None:
+    value = meta.get("ply_file_path")
+    return None if value is None else file.parent / relative_path(file, "ply_file_path", value)
+
+
+# ---------------------------------------------------------------------------------------------- parts
+
+
+def _part_names(metas: Sequence[_Meta], frames: Sequence[Frame], report: Report) -> dict[int, str]:
+    named: tuple[Path, list[str]] | None = None
+    for file, meta in metas:
+        try:
+            classes = _classes(file, meta)
+        except CaptureError as error:
+            report(error.problem)
+            continue
+        if classes is not None and named is not None and classes != named[1]:
+            mend = f"use the list of {named[0]} in all states"
+            report(Problem("error", file, "semantic_classes differs from another state's", mend))
+        elif classes is not None:
+            named = named or (file, classes)
+    if named is not None:
+        return {i + 1: name for i, name in enumerate(safe_names(named[1]))}
+    return {i: f"part_{i}" for i in range(1, _largest_label(frames, report) + 1)}
+
+
+def _classes(file: Path, meta: dict[str, Any]) -> list[str] | None:
+    classes = meta.get("semantic_classes")
+    if classes is None:
+        return None
+    if not isinstance(classes, list) or not classes or not all(isinstance(c, str) for c in classes):
+        raise CaptureError(
+            file, f"semantic_classes is {show(classes)}", 'write a list of names, "background" first, then the parts'
+        )
+    if classes[0].lower() not in ("background", "bg"):
+        raise CaptureError(
+            file, f"semantic_classes begins with {show(classes[0])}", 'put "background" first: it is the label 0'
+        )
+    if len(classes) - 1 > MAX_LABEL:
+        raise CaptureError(file, f"semantic_classes has {len(classes) - 1} parts", f"name at most {MAX_LABEL}")
+    return classes[1:]
+
+
+def safe_names(names: Sequence[str]) -> list[str]:
+    """Names that can be file names everywhere: of [A-Za-z0-9_.-], and unique even where case does not count."""
+    out: list[str] = []
+    taken: set[str] = set()
+    for i, name in enumerate(names):
+        base = re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("._-")[:64] or f"part_{i + 1}"
+        safe, n = base, 1
+        while safe.lower() in taken:
+            n += 1
+            safe = f"{base}_{n}"
+        taken.add(safe.lower())
+        out.append(safe)
+    return out
+
+
+def _largest_label(frames: Sequence[Frame], report: Report) -> int:
+    def largest(path: Path) -> int:
+        try:
+            labels = read_labels(path)
+        except CaptureError as error:
+            report(error.problem)
+            return 0
+        return int(labels[labels != UNLABELLED].max(initial=0))
+
+    with ThreadPoolExecutor() as pool:
+        return max(pool.map(largest, [f.labels for f in frames if f.labels is not None]), default=0)
+
+
+def _raise(problem: Problem) -> None:
+    if problem.severity == "error":
+        raise CaptureError(problem.file, problem.message, problem.mend)

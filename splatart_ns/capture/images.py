@@ -1,0 +1,211 @@
+"""Images, labels, masks and depths as arrays: reading, undistortion, downscaling.
+
+All readers raise `InputError` when the file is missing, damaged or not of the kind that is asked for.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from splatart_ns.capture.capture import UNLABELLED, Camera, CaptureError
+from splatart_ns.errors import InputError
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8\xff"
+_PNG_COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGBA"}
+MAX_LABEL = UNLABELLED - 1
+
+
+def read_image(path: Path) -> np.ndarray:
+    """A colour image, uint8 [H, W, 3] RGB or [H, W, 4] RGBA with straight alpha.
+
+    Grey images are repeated over the channels, 16-bit values are divided by 257.
+    """
+    pixels = _to_bytes(path, _decode(path, _read_bytes(path)))
+    if pixels.ndim == 2:
+        return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB)
+    return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
+
+
+def read_labels(path: Path) -> np.ndarray:
+    """Part ids, uint8 [H, W]: 0 background, 1..254 parts, 255 unlabelled; from a one-channel PNG of 8 or 16 bits."""
+    data = _read_bytes(path)
+    if not data.startswith(_PNG) or len(data) < 33:
+        raise CaptureError(path, "labels are not a PNG file", "save the part ids as a one-channel 8- or 16-bit PNG")
+    bits, colour_type = data[24], data[25]
+    if colour_type != 0 or bits < 8:
+        kind = _PNG_COLOUR_TYPES.get(colour_type, f"colour type {colour_type}")
+        raise CaptureError(
+            path,
+            f"labels are a {bits}-bit {kind} PNG",
+            "save the part ids themselves in one grey channel of 8 or 16 bits, without colours",
+        )
+    labels = _decode(path, data)
+    if labels.dtype == np.uint16:
+        if labels.max(initial=0) > UNLABELLED:
+            raise CaptureError(
+                path,
+                f"label {labels.max()} is above the largest part id, {MAX_LABEL}",
+                f"number the parts 1 to {MAX_LABEL} and write {UNLABELLED} where nothing is labelled",
+            )
+        labels = labels.astype(np.uint8)
+    return labels
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """A silhouette or a mask, uint8 [H, W], 0 outside and 255 inside; masks of 0 and 1 are stretched to 0 and 255."""
+    mask = _to_bytes(path, _decode(path, _read_bytes(path)))
+    if mask.ndim == 3:
+        if not (mask[..., :1] == mask[..., :3]).all():
+            raise CaptureError(path, "the mask is a colour image", "save it with one grey channel")
+        mask = np.ascontiguousarray(mask[..., 0])
+    return mask * np.uint8(255) if mask.max(initial=0) <= 1 else mask
+
+
+def read_depth(path: Path, unit: float = 1e-3) -> np.ndarray:
+    """Depth along the optical axis, float32 [H, W], 0 where unknown, in nerfstudio's convention.
+
+    The file is a 16- or 32-bit one-channel image or a `.npy` array; both are multiplied by `unit`, the length of
+    one count (nerfstudio's `depth_unit_scale_factor`: millimetres in a world of metres).
+    """
+    if path.suffix.lower() == ".npy":
+        try:
+            depth = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise CaptureError(path, f"the depth cannot be read ({error})", "save it again with numpy.save") from None
+        if not isinstance(depth, np.ndarray) or depth.dtype.kind not in "fiu":
+            raise CaptureError(path, "the depth is not an array of numbers", "save it as float32 with numpy.save")
+    else:
+        depth = _decode(path, _read_bytes(path))
+        if depth.dtype == np.uint8:
+            raise CaptureError(path, "the depth image has 8 bits", "save the depth as a 16-bit PNG in millimetres")
+    if depth.ndim == 3 and depth.shape[2] == 1:
+        depth = depth[..., 0]
+    if depth.ndim != 2:
+        raise CaptureError(path, f"the depth has the shape {depth.shape}", "save it with one channel")
+    return np.nan_to_num(depth.astype(np.float32) * np.float32(unit), nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image; of a PNG without decoding it."""
+    data = _read_bytes(path, 24)
+    if data.startswith(_PNG) and len(data) == 24:
+        return struct.unpack(">II", data[16:24])
+    height, width = read_image(path).shape[:2]
+    return width, height
+
+
+def undistorted_camera(camera: Camera) -> Camera:
+    """The camera without distortion whose image `undistort` gives: nerfstudio's new camera matrix and crop."""
+    return _undistortion(camera)[0] if camera.distorted else camera
+
+
+def undistort(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """An image or mask [H, W] or [H, W, C] as `undistorted_camera(camera)` sees it, interpolated linearly.
+
+    Colours are weighted by their alpha, so that what lies behind transparent pixels does not bleed in.
+    """
+    if not camera.distorted:
+        return image
+    _, maps = _undistortion(camera)
+    return _filter(image, lambda x: cv2.remap(x, maps[0], maps[1], cv2.INTER_LINEAR))
+
+
+def undistort_labels(labels: np.ndarray, camera: Camera) -> np.ndarray:
+    """Labels [H, W] as `undistorted_camera(camera)` sees them, by the nearest pixel; 255 where no pixel is."""
+    if not camera.distorted:
+        return labels
+    _, maps = _undistortion(camera)
+    return cv2.remap(labels, maps[0], maps[1], cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, UNLABELLED)
+
+
+def downscale(image: np.ndarray, factor: int) -> np.ndarray:
+    """The image's means over factor x factor pixels, colours weighted by their alpha; the remainder is cut off."""
+    if factor == 1:
+        return image
+    h, w = image.shape[0] // factor, image.shape[1] // factor
+    cut = image[: h * factor, : w * factor]
+    return _filter(cut, lambda x: cv2.resize(x, (w, h), interpolation=cv2.INTER_AREA))
+
+
+def downscale_labels(labels: np.ndarray, factor: int) -> np.ndarray:
+    """The label in the middle of each block of factor x factor pixels; ids are never mixed."""
+    h, w = labels.shape[0] // factor, labels.shape[1] // factor
+    return np.ascontiguousarray(labels[factor // 2 :: factor, factor // 2 :: factor][:h, :w])
+
+
+def _read_bytes(path: Path, size: int = -1) -> bytes:
+    if not os.path.isfile(path):
+        raise CaptureError(path, "the file does not exist", "add it or correct its path")
+    try:
+        with open(path, "rb") as file:
+            return file.read(size)
+    except OSError as error:
+        raise CaptureError(path, f"the file cannot be read ({error.strerror})", "make it readable") from None
+
+
+def _decode(path: Path, data: bytes) -> np.ndarray:
+    # OpenCV fills the missing part of a cut-off JPEG with grey; its end marker must follow the last scan's start.
+    cut_off = data.startswith(_JPEG) and data.find(b"\xff\xd9", max(data.rfind(b"\xff\xda"), 0)) < 0
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data and not cut_off else None
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise CaptureError(path, "the image is cut off, damaged or of an unknown kind", "copy or export it again")
+    return pixels
+
+
+def _to_bytes(path: Path, pixels: np.ndarray) -> np.ndarray:
+    if pixels.dtype == np.uint16:
+        pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if pixels.dtype != np.uint8:
+        raise CaptureError(path, f"the image holds {pixels.dtype} values", "save it with 8 or 16 bits a channel")
+    return pixels
+
+
+def _filter(image: np.ndarray, function) -> np.ndarray:
+    """A linear filter of an image; of RGBA on colours that are multiplied by alpha, given back straight."""
+    if image.ndim == 2 or image.shape[2] == 3:
+        return function(image)
+    alpha = image[..., 3:].astype(np.float32)
+    filtered = function(np.concatenate([image[..., :3] * alpha, alpha], axis=2))
+    colour = filtered[..., :3] / np.maximum(filtered[..., 3:], 1e-6)
+    return np.rint(np.concatenate([colour, filtered[..., 3:]], axis=2)).clip(0, 255).astype(np.uint8)
+
+
+@lru_cache(maxsize=16)
+def _undistortion(camera: Camera) -> tuple[Camera, tuple[np.ndarray, np.ndarray]]:
+    """The pinhole camera and, for each of its pixels, where it lies in the distorted image.
+
+    As nerfstudio's FullImageDatamanager: OpenCV's optimal new camera matrix with no empty pixels (alpha = 0), cropped
+    to its region of interest, in a frame whose pixel centres are integers.
+    """
+    k1, k2, k3, _, p1, p2 = camera.distortion
+    distortion = np.array([k1, k2, p1, p2, k3])
+    half = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+    size = (camera.width, camera.height)
+    K, (x, y, w, h) = cv2.getOptimalNewCameraMatrix(camera.K - half, distortion, size, 0)
+    if w <= 0 or h <= 0 or not np.isfinite(K).all():
+        raise InputError(f"The distortion (k1, k2, k3, k4, p1, p2) = {camera.distortion} leaves no image; correct it.")
+    maps = cv2.initUndistortRectifyMap(camera.K - half, distortion, None, K, size, cv2.CV_32FC1)
+    crop = tuple(np.ascontiguousarray(m[y : y + h, x : x + w]) for m in maps)
+    K = K + half
+    camera = replace(
+        camera,
+        fx=float(K[0, 0]),
+        fy=float(K[1, 1]),
+        cx=float(K[0, 2] - x),
+        cy=float(K[1, 2] - y),
+        width=w,
+        height=h,
+        distortion=(0.0,) * 6,
+    )
+    return camera, crop

@@ -1,0 +1,330 @@
+"""A URDF as data: links, joints, shapes, and where they are at given joint values."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from splatart_ns.capture import meshes
+from splatart_ns.capture.surface import Surface, join, merge_coincident
+from splatart_ns.errors import InputError
+
+MOVABLE = ("revolute", "continuous", "prismatic")
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """A joint's value as multiplier * (the other joint's value) + offset."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class Joint:
+    """How a link hangs on its parent."""
+
+    name: str
+    type: str
+    """"revolute", "continuous", "prismatic" or "fixed"."""
+    parent: str
+    child: str
+    T_parent_joint: np.ndarray
+    """[4, 4]: the joint's frame, and the child's at value 0, in the parent link's frame."""
+    axis: np.ndarray
+    """[3], unit length, in the joint's frame."""
+    limits: tuple[float, float] | None
+    mimic: Mimic | None
+
+    def motion(self, value: float) -> np.ndarray:
+        """T_joint_child [4, 4] at a value in radian or length."""
+        T = np.eye(4)
+        if self.type in ("revolute", "continuous"):
+            T[:3, :3] = Rotation.from_rotvec(value * self.axis).as_matrix()
+        elif self.type == "prismatic":
+            T[:3, 3] = value * self.axis
+        return T
+
+
+@dataclass(frozen=True)
+class Part:
+    """Links that hold together rigidly."""
+
+    name: str
+    """The first of the links that has a shape, else the first link."""
+    links: tuple[str, ...]
+    """The first one is the link whose frame is the part's frame."""
+    has_geometry: bool
+
+    @property
+    def frame_link(self) -> str:
+        return self.links[0]
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A tree of links and joints, as a URDF tells it."""
+
+    path: Path
+    name: str
+    links: dict[str, tuple[ElementTree.Element, ...]]
+    """Link name to its <visual> elements."""
+    joints: tuple[Joint, ...]
+    root: str
+
+    @property
+    def movable(self) -> tuple[Joint, ...]:
+        return tuple(j for j in self.joints if j.type in MOVABLE)
+
+    def joint(self, name: str) -> Joint:
+        for joint in self.movable:
+            if joint.name == name:
+                return joint
+        known = ", ".join(j.name for j in self.movable) or "none"
+        raise InputError(f"{self.path}: there is no movable joint {name!r}; the movable joints are: {known}.")
+
+    def complete(self, values: Mapping[str, float]) -> dict[str, float]:
+        """A value for every movable joint: those given, 0 (or the limit next to it) for others, mimics computed."""
+        out: dict[str, float] = {}
+        for joint in self.movable:
+            low, high = joint.limits or (-math.inf, math.inf)
+            out[joint.name] = float(values.get(joint.name, min(max(0.0, low), high)))
+        # A mimic may follow a mimic: settle as many times as there are joints.
+        for _ in self.movable:
+            for joint in self.movable:
+                if joint.mimic is not None:
+                    m = joint.mimic
+                    out[joint.name] = m.multiplier * out[m.joint] + m.offset
+        return out
+
+    def link_poses(self, values: Mapping[str, float]) -> dict[str, np.ndarray]:
+        """T_world_link [4, 4] of every link; the world is the root link's frame."""
+        values = self.complete(values)
+        poses = {self.root: np.eye(4)}
+        children = _children(self.joints)
+        queue = [self.root]
+        while queue:
+            link = queue.pop(0)
+            for joint in children.get(link, ()):
+                poses[joint.child] = poses[link] @ joint.T_parent_joint @ joint.motion(values.get(joint.name, 0.0))
+                queue.append(joint.child)
+        return poses
+
+    def parts(self, frozen: Mapping[str, float] | None = None) -> tuple[Part, ...]:
+        """Links grouped by fixed and frozen joints: the root's part first, then down the tree in the file's order."""
+        held = frozen or {}
+        children = _children(self.joints)
+        parts, roots = [], [self.root]
+        while roots:
+            links, queue = [], [roots.pop(0)]
+            while queue:
+                link = queue.pop(0)
+                links.append(link)
+                for joint in children.get(link, ()):
+                    moves = joint.type in MOVABLE and joint.name not in held
+                    (roots if moves else queue).append(joint.child)
+            shaped = [link for link in links if self.links[link]]
+            parts.append(Part((shaped or links)[0], tuple(links), bool(shaped)))
+        return tuple(parts)
+
+    def surface(self, part: Part, values: Mapping[str, float]) -> Surface | None:
+        """A part's surface in its own frame, None where no link of it has a shape. `values` place frozen joints."""
+        poses = self.link_poses(values)
+        T_part_world = np.linalg.inv(poses[part.frame_link])
+        surfaces = [
+            shape.moved(T_part_world @ poses[link]) for link in part.links for shape in self._link_surfaces(link)
+        ]
+        return merge_coincident(join(surfaces)) if surfaces else None
+
+    def _link_surfaces(self, link: str) -> list[Surface]:
+        return [_visual(v, self.path).moved(_origin(v, self.path)) for v in self.links[link]]
+
+
+def read_urdf(path: Path) -> Robot:
+    """Read a URDF. Floating and planar joints are read as fixed, at their zero.
+
+    Raises:
+        InputError: not a URDF, or one whose links and joints do not make a tree.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; give the path of a URDF.")
+    try:
+        robot = ElementTree.fromstring(path.read_bytes())
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path}: not well-formed XML ({error}); give a URDF.") from error
+    if robot.tag != "robot":
+        raise InputError(f"{path}: the outermost element is <{robot.tag}>, not <robot>; give a URDF.")
+    if any("xacro" in str(e.tag) for e in robot.iter()):
+        raise InputError(f"{path}: holds xacro macros; expand it first with `xacro {path.name} > robot.urdf`.")
+
+    colours = {
+        m.get("name"): m for m in robot.findall("material") if m.find("color") is not None
+    }
+    links: dict[str, tuple[ElementTree.Element, ...]] = {}
+    for element in robot.findall("link"):
+        name = _attribute(element, "name", path)
+        if name in links:
+            raise InputError(f"{path}: two links are called {name!r}; rename one.")
+        visuals = tuple(v for v in element.findall("visual") if v.find("geometry") is not None)
+        for visual in visuals:
+            material = visual.find("material")
+            if material is not None and material.find("color") is None and material.get("name") in colours:
+                material.append(colours[material.get("name")].find("color"))
+        links[name] = visuals
+    joints = tuple(_joint(e, path) for e in robot.findall("joint"))
+    return Robot(path, robot.get("name", path.stem), links, joints, _root(links, joints, path))
+
+
+def _joint(element: ElementTree.Element, path: Path) -> Joint:
+    name, type = _attribute(element, "name", path), _attribute(element, "type", path)
+    if type not in (*MOVABLE, "fixed", "floating", "planar"):
+        raise InputError(f"{path}: joint {name!r} is of type {type!r}; use revolute, continuous, prismatic or fixed.")
+    parent, child = element.find("parent"), element.find("child")
+    if parent is None or child is None:
+        raise InputError(f"{path}: joint {name!r} lacks its <parent> or <child>; add it.")
+
+    axis_element = element.find("axis")
+    axis = np.array([1.0, 0.0, 0.0]) if axis_element is None else _numbers(axis_element, "xyz", 3, path)
+    length = float(np.linalg.norm(axis))
+    if type in MOVABLE and not length > 0.0:
+        raise InputError(f"{path}: joint {name!r} has the axis {axis.tolist()}; give it a direction.")
+
+    limits, limit = None, element.find("limit")
+    if type in ("revolute", "prismatic") and limit is not None:
+        low, high = (_numbers(limit, key, 1, path, "0")[0] for key in ("lower", "upper"))
+        if low > high:
+            raise InputError(f"{path}: joint {name!r} has limits {low} to {high}; exchange lower and upper.")
+        limits = (float(low), float(high))
+
+    mimic_element, mimic = element.find("mimic"), None
+    if mimic_element is not None and type in MOVABLE:
+        mimic = Mimic(
+            _attribute(mimic_element, "joint", path),
+            float(_numbers(mimic_element, "multiplier", 1, path, "1")[0]),
+            float(_numbers(mimic_element, "offset", 1, path, "0")[0]),
+        )
+    return Joint(
+        name=name,
+        type=type if type in MOVABLE else "fixed",
+        parent=_attribute(parent, "link", path),
+        child=_attribute(child, "link", path),
+        T_parent_joint=_origin(element, path),
+        axis=axis / length if length > 0.0 else axis,
+        limits=limits,
+        mimic=mimic,
+    )
+
+
+def _root(links: Mapping[str, object], joints: tuple[Joint, ...], path: Path) -> str:
+    """The link that is nobody's child, once links and joints are known to make one tree."""
+    names = [j.name for j in joints]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{path}: two joints are called {name!r}; rename one.")
+    for joint in joints:
+        for link in (joint.parent, joint.child):
+            if link not in links:
+                raise InputError(f"{path}: joint {joint.name!r} names the link {link!r}, which is not there; add it.")
+        if joint.mimic is not None and joint.mimic.joint not in {j.name for j in joints if j.type in MOVABLE}:
+            raise InputError(f"{path}: joint {joint.name!r} mimics {joint.mimic.joint!r}, which is no movable joint.")
+    parents = [j.child for j in joints]
+    for link in parents:
+        if parents.count(link) > 1:
+            raise InputError(f"{path}: link {link!r} is the child of two joints; a URDF is a tree, remove one.")
+    roots = [link for link in links if link not in parents]
+    if len(roots) != 1:
+        found = ", ".join(roots) or "none"
+        raise InputError(f"{path}: a URDF has one root link, here they are: {found}; join them into one tree.")
+    reached, children = {roots[0]}, _children(joints)
+    queue = [roots[0]]
+    while queue:
+        below = [j.child for j in children.get(queue.pop(), ())]
+        reached.update(below)
+        queue.extend(below)
+    lost = [link for link in links if link not in reached]
+    if lost:
+        raise InputError(f"{path}: the links {', '.join(lost)} hang in a loop; a URDF is a tree, remove a joint.")
+    return roots[0]
+
+
+def _children(joints: tuple[Joint, ...]) -> dict[str, list[Joint]]:
+    out: dict[str, list[Joint]] = {}
+    for joint in joints:
+        out.setdefault(joint.parent, []).append(joint)
+    return out
+
+
+def _visual(visual: ElementTree.Element, path: Path) -> Surface:
+    """The shape of a <visual>, before its <origin>."""
+    colour_element = visual.find("material/color")
+    colour = None if colour_element is None else tuple(_numbers(colour_element, "rgba", 4, path)[:3])
+    shapes = list(visual.find("geometry"))
+    if len(shapes) != 1:
+        raise InputError(f"{path}: a <geometry> holds {len(shapes)} shapes; give it one.")
+    shape = shapes[0]
+    if shape.tag == "mesh":
+        scale = _numbers(shape, "scale", 3, path, "1 1 1")
+        mesh = find_mesh(_attribute(shape, "filename", path), path)
+        return meshes.load_mesh(mesh, colour).moved(np.diag([*scale, 1.0]))
+    if shape.tag == "box":
+        return meshes.box(_numbers(shape, "size", 3, path), colour)
+    if shape.tag == "cylinder":
+        return meshes.cylinder(
+            _numbers(shape, "radius", 1, path)[0], _numbers(shape, "length", 1, path)[0], colour
+        )
+    if shape.tag == "sphere":
+        return meshes.sphere(_numbers(shape, "radius", 1, path)[0], colour)
+    raise InputError(f"{path}: the shape <{shape.tag}> is not known; use mesh, box, cylinder or sphere.")
+
+
+def find_mesh(name: str, urdf: Path) -> Path:
+    """The file that a URDF means by a mesh's name: package://, file://, absolute, or relative to the URDF.
+
+    A package is looked for upwards from the URDF: the folder of that name, or the one that holds the rest of the path.
+    """
+    folder = urdf.resolve().parent
+    if not name.startswith(("package://", "model://")):
+        return folder / name.removeprefix("file://")
+    package, _, rest = name.split("://", 1)[1].partition("/")
+    for above in (folder, *folder.parents):
+        for root in (above / package, above):
+            if (root / rest).is_file():
+                return root / rest
+    raise InputError(f"{urdf}: {name} is not found in the folders above the URDF; put the package {package!r} there.")
+
+
+def _origin(element: ElementTree.Element, path: Path) -> np.ndarray:
+    T = np.eye(4)
+    origin = element.find("origin")
+    if origin is not None:
+        T[:3, :3] = Rotation.from_euler("xyz", _numbers(origin, "rpy", 3, path, "0 0 0")).as_matrix()
+        T[:3, 3] = _numbers(origin, "xyz", 3, path, "0 0 0")
+    return T
+
+
+def _attribute(element: ElementTree.Element, key: str, path: Path) -> str:
+    value = element.get(key)
+    if not value:
+        raise InputError(f"{path}: a <{element.tag}> lacks its attribute {key!r}; add it.")
+    return value
+
+
+def _numbers(
+    element: ElementTree.Element, key: str, count: int, path: Path, default: str | None = None
+) -> np.ndarray:
+    text = element.get(key, default)
+    try:
+        numbers = np.array([float(x) for x in text.split()]) if text is not None else np.empty(0)
+    except ValueError:
+        numbers = np.empty(0)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise InputError(f"{path}: <{element.tag} {key}={text!r}> should hold {count} finite numbers; mend it.")
+    return numbers

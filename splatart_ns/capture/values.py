@@ -1,0 +1,151 @@
+"""The values in a capture's JSON files: numbers, paths, matrices, cameras, poses, each checked as it is read.
+
+All functions raise `CaptureError`, which names the file, the entry (`what`, or its `owner`) and the value found.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import reprlib
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from splatart_ns.capture.capture import Camera, CaptureError
+from splatart_ns.capture.images import image_size
+
+PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_LONGEST = 1e12  # a coordinate or focal length beyond this is a mistake, and its square still is a float
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(file.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise CaptureError(file, f"the file cannot be read ({error.strerror})", "make it readable") from None
+    except (ValueError, RecursionError) as error:
+        raise CaptureError(file, f"the file is not JSON ({error})", "write it again, or restore a copy") from None
+    if not isinstance(value, dict):
+        raise CaptureError(file, f"the file holds {show(value)}", "write one JSON object")
+    return value
+
+
+def relative_path(file: Path, what: str, value: Any) -> str:
+    """A path as JSON gives it, in one spelling: ./a//b is a/b."""
+    if not isinstance(value, str) or not value.strip() or "\0" in value:
+        found = "is missing" if value is None else f"is {show(value)}"
+        raise CaptureError(file, f"{what} {found}", "give the path of a file, from this file's folder")
+    return PurePosixPath(value).as_posix()
+
+
+def parse_number(file: Path, what: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not -_LONGEST < value < _LONGEST:
+        raise CaptureError(file, f"{what} is {show(value)}", "write a number")
+    return float(value)
+
+
+def parse_matrix(file: Path, what: str, value: Any, shapes: Sequence[tuple[int, int]]) -> np.ndarray:
+    if isinstance(value, list) and all(isinstance(row, list) for row in value):
+        rows = [[parse_number(file, f"an entry of {what}", x) for x in row] for row in value]
+        if any(len(rows) == m and all(len(row) == n for row in rows) for m, n in shapes):
+            return np.array(rows)
+    found = "is missing" if value is None else f"is {show(value)}"
+    raise CaptureError(file, f"{what} {found}", f"write a {shapes[0][0]}x{shapes[0][1]} matrix as a list of rows")
+
+
+def show(value: Any) -> str:
+    return reprlib.repr(value)
+
+
+def parse_camera(file: Path, owner: str, values: dict[str, Any], image: Path) -> Camera:
+    """A camera from nerfstudio's keys in `values`; the image is looked at only where w or h are missing."""
+
+    def number(key: str) -> float | None:
+        value = values.get(key)
+        return None if value is None else parse_number(file, f"{key} of {owner}", value)
+
+    def positive(key: str) -> float | None:
+        value = number(key)
+        if value is not None and value <= 0:
+            raise CaptureError(file, f"{key} of {owner} is {value:g}", "it must be positive")
+        return value
+
+    def focal(key: str, angle_key: str, size: int) -> float | None:
+        angle = positive(angle_key) if values.get(key) is None else None
+        if angle is None:
+            return positive(key)
+        if angle >= 3.1:
+            raise CaptureError(file, f"{angle_key} of {owner} is {angle:g}", "give the field of view in radians")
+        return size / 2 / math.tan(angle / 2)
+
+    model = values.get("camera_model", "OPENCV")
+    if model not in PINHOLE_MODELS:
+        raise CaptureError(
+            file,
+            f"camera_model of {owner} is {show(model)}",
+            "undistort the images to a pinhole camera first (for instance with COLMAP) and write OPENCV",
+        )
+    width, height = positive("w"), positive("h")
+    if width is None or height is None:
+        width, height = image_size(image)
+    if width != int(width) or height != int(height) or max(width, height) > 65535:
+        raise CaptureError(file, f"w and h of {owner} are {width:g} and {height:g}", "give whole numbers of pixels")
+    width, height = int(width), int(height)
+    fx = focal("fl_x", "camera_angle_x", width)
+    fy = focal("fl_y", "camera_angle_y", height)
+    if fx is None and fy is None:
+        raise CaptureError(file, f"{owner} has no focal length", "add fl_x and fl_y, in pixels, or camera_angle_x")
+    cx, cy = number("cx"), number("cy")
+    return Camera(
+        fx=fx or fy,
+        fy=fy or fx,
+        cx=width / 2 if cx is None else cx,
+        cy=height / 2 if cy is None else cy,
+        width=width,
+        height=height,
+        distortion=_distortion(file, owner, values),
+    )
+
+
+def _distortion(file: Path, owner: str, values: dict[str, Any]) -> tuple[float, ...]:
+    given = values.get("distortion_params")
+    if given is None:
+        given = [values.get(key) or 0.0 for key in _DISTORTION]
+    if not isinstance(given, list) or len(given) != len(_DISTORTION):
+        found = f"distortion_params of {owner} is {show(given)}"
+        raise CaptureError(file, found, "list k1, k2, k3, k4, p1, p2")
+    out = tuple(parse_number(file, f"{key} of {owner}", value) for key, value in zip(_DISTORTION, given, strict=True))
+    if out[3] != 0.0:
+        raise CaptureError(
+            file, f"k4 of {owner} is {out[3]:g}", "a pinhole camera has no k4 in nerfstudio: undistort the images first"
+        )
+    return out
+
+
+def parse_pose(file: Path, owner: str, value: Any) -> np.ndarray:
+    """A camera-to-world pose [4, 4], its rotation made exactly orthonormal."""
+    what = f"transform_matrix of {owner}"
+    given = parse_matrix(file, what, value, ((4, 4), (3, 4)))
+    T = np.eye(4)
+    T[: len(given)] = given
+    if np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise CaptureError(file, f"{what} has the last row {T[3].tolist()}", "write a camera-to-world pose, row by row")
+    U, S, Vt = np.linalg.svd(T[:3, :3])
+    scale = float(np.cbrt(np.prod(S)))
+    if S[2] < 1e-6:
+        found, mend = "cannot be inverted", "write a rotation and a translation"
+    elif np.abs(S / scale - 1).max() > 1e-2:
+        found, mend = "shears or stretches", "write a rotation and a translation"
+    elif abs(scale - 1) > 1e-2:
+        found, mend = f"scales by {scale:.4g}", "divide its first three columns by this"
+    elif np.linalg.det(T[:3, :3]) < 0:
+        found, mend = "mirrors", "negate one column of the rotation, or undo the change of handedness"
+    else:
+        T[:3, :3] = U @ Vt
+        T[3] = [0, 0, 0, 1]
+        return T
+    raise CaptureError(file, f"{what} {found}", mend)

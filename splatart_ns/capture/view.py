@@ -1,0 +1,153 @@
+"""One frame's pixels and camera as tensors, undistorted and in the normalised world."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from splatart_ns.capture.capture import Capture, CaptureError, Frame, Normalization, State
+from splatart_ns.capture.images import (
+    downscale,
+    downscale_labels,
+    read_image,
+    read_labels,
+    read_mask,
+    undistort,
+    undistort_labels,
+    undistorted_camera,
+)
+from splatart_ns.errors import InputError
+
+
+@dataclass
+class View:
+    """What one pinhole camera saw."""
+
+    name: str
+    viewmat: Tensor
+    """World to camera [4, 4] float32, OpenCV axes, in the normalised world."""
+    K: Tensor
+    """[3, 3] float32, pixel centres at + 0.5."""
+    width: int
+    height: int
+    rgb: Tensor
+    """uint8 [H, W, 3], straight: not multiplied by alpha."""
+    alpha: Tensor | None = None
+    """uint8 [H, W], the object's silhouette."""
+    labels: Tensor | None = None
+    """uint8 [H, W]: 0 background, 1..P parts, 255 unlabelled."""
+    mask: Tensor | None = None
+    """bool [H, W], the pixels that count in the loss."""
+
+    def rgb_on(self, background: Tensor) -> Tensor:
+        """The image in front of a background colour [3] in 0..1: float32 [H, W, 3] in 0..1."""
+        rgb = self.rgb.float() / 255
+        if self.alpha is None:
+            return rgb
+        alpha = self.alpha.float()[..., None] / 255
+        return rgb * alpha + background * (1 - alpha)
+
+
+def load_views(capture: Capture, state: int | State, split: str = "train", downscale: int = 1) -> list[View]:
+    """The views of one split of a state (its number, or itself), `downscale` times smaller, in the frames' order.
+
+    Raises `InputError` for a file that cannot be used.
+    """
+    frames = (capture.states[state] if isinstance(state, int) else state).split(split)
+    with ThreadPoolExecutor() as pool:
+        return list(pool.map(lambda frame: load_view(frame, capture.normalization, downscale), frames))
+
+
+def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) -> View:
+    """One view; the silhouette comes from the frame's object mask, else from the image's alpha, else it is None.
+
+    Raises `InputError` for a file that cannot be used.
+    """
+    pixels = read_pixels(frame)
+    camera = undistorted_camera(frame.camera).downscaled(downscale)
+    if min(camera.width, camera.height) < 1:
+        raise InputError(f"{frame.image}: nothing is left of the image at 1/{downscale}; use a smaller factor.")
+    image = _shrink(pixels.image, frame, downscale)
+    alpha = None if image.shape[2] == 3 else torch.from_numpy(np.ascontiguousarray(image[..., 3]))
+    if pixels.object_mask is not None:
+        alpha = torch.from_numpy(_shrink(pixels.object_mask, frame, downscale))
+    labels = mask = None
+    if pixels.labels is not None:
+        labels = torch.from_numpy(downscale_labels(undistort_labels(pixels.labels, frame.camera), downscale))
+    if pixels.mask is not None:
+        mask = torch.from_numpy(_shrink(pixels.mask, frame, downscale) > 127)
+    T = normalization.camera_to_normal(frame.T_world_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return View(
+        name=frame.name,
+        viewmat=torch.from_numpy(np.linalg.inv(T)).float(),
+        K=torch.from_numpy(camera.K).float(),
+        width=camera.width,
+        height=camera.height,
+        rgb=torch.from_numpy(np.ascontiguousarray(image[..., :3])),
+        alpha=alpha,
+        labels=labels,
+        mask=mask,
+    )
+
+
+@dataclass
+class Pixels:
+    """A frame's files as they are on disk, all of the camera's size."""
+
+    image: np.ndarray
+    """uint8 [H, W, 3] or [H, W, 4]."""
+    labels: np.ndarray | None = None
+    object_mask: np.ndarray | None = None
+    mask: np.ndarray | None = None
+
+
+def read_pixels(frame: Frame) -> Pixels:
+    """Decode a frame's files. Raises `InputError` for one that is missing, damaged or of another size."""
+    pixels = Pixels(_of_size(frame, frame.image, read_image(frame.image)))
+    if frame.labels is not None:
+        pixels.labels = _of_size(frame, frame.labels, read_labels(frame.labels))
+    if frame.object_mask is not None:
+        pixels.object_mask = _of_size(frame, frame.object_mask, read_mask(frame.object_mask))
+    if frame.mask is not None:
+        pixels.mask = _of_size(frame, frame.mask, np.where(read_mask(frame.mask) != 0, np.uint8(255), np.uint8(0)))
+    return pixels
+
+
+def load_points(path: Path, normalization: Normalization) -> tuple[Tensor, Tensor]:
+    """A point cloud (PLY) in the normalised world: float32 [N, 3], and uint8 colours [N, 3], grey where it has none.
+
+    Raises `InputError` if it cannot be read or is empty.
+    """
+    try:
+        cloud = trimesh.load(path, file_type="ply", process=False)
+        xyz = np.asarray(cloud.vertices, dtype=np.float64)
+        rgb = np.asarray(cloud.visual.vertex_colors)
+    except Exception as error:  # trimesh lets whatever its parsers meet through
+        found = f"the point cloud cannot be read ({type(error).__name__}: {error})"
+        raise CaptureError(path, found, "write it again as a PLY of points, or take ply_file_path out") from None
+    if len(xyz) == 0 or not np.isfinite(xyz).all():
+        raise CaptureError(path, "the point cloud is empty or not finite", "write it again, or take ply_file_path out")
+    rgb = rgb[:, :3].astype(np.uint8) if len(rgb) == len(xyz) else np.full(xyz.shape, 128, np.uint8)
+    return torch.from_numpy(normalization.scale * (xyz - normalization.centre)).float(), torch.from_numpy(rgb)
+
+
+def _shrink(image: np.ndarray, frame: Frame, factor: int) -> np.ndarray:
+    return downscale(undistort(image, frame.camera), factor)
+
+
+def _of_size(frame: Frame, path: Path, array: np.ndarray) -> np.ndarray:
+    height, width = array.shape[:2]
+    camera = frame.camera
+    if (width, height) != (camera.width, camera.height):
+        raise CaptureError(
+            path,
+            f"it is {width}x{height} pixels, but its camera is {camera.width}x{camera.height}",
+            "resize the file, or correct w, h and the intrinsics",
+        )
+    return array

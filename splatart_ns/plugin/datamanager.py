@@ -1,0 +1,86 @@
+"""Full images with alpha and part labels, for one state of a capture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
+
+from splatart_ns.capture.capture import UNLABELLED, Capture
+from splatart_ns.capture.view import View, load_points, load_view
+from splatart_ns.stages.hull import seed_points
+
+
+class CaptureDataset(InputDataset):
+    """Frames of one state. Frames may lack labels: their `semantics` are all 255."""
+
+    exclude_batch_keys_from_device = [*InputDataset.exclude_batch_keys_from_device, "semantics"]
+
+    def get_view(self, image_idx: int) -> View:
+        """One frame's pixels, undistorted."""
+        metadata = self._dataparser_outputs.metadata
+        frame = metadata["frames"][image_idx]
+        return load_view(frame, metadata["normalization"], downscale=round(1 / self.scale_factor))
+
+    def get_data(self, image_idx: int, image_type: str = "float32") -> dict[str, Any]:
+        """image [H, W, 3 or 4] (the silhouette as alpha, where there is one), semantics [H, W, 1], mask [H, W, 1]."""
+        view = self.get_view(image_idx)
+        image = view.rgb if view.alpha is None else torch.cat([view.rgb, view.alpha[..., None]], dim=-1)
+        labels = torch.full(view.rgb.shape[:2], UNLABELLED, dtype=torch.uint8) if view.labels is None else view.labels
+        data = {
+            "image_idx": image_idx,
+            "image": image if image_type == "uint8" else image.float() / 255,
+            "semantics": labels[..., None].long(),
+        }
+        if view.mask is not None:
+            data["mask"] = view.mask[..., None]
+        return data
+
+
+@dataclass
+class SplatartDatamanagerConfig(FullImageDatamanagerConfig):
+    """Caches all images of one state."""
+
+    _target: type = field(default_factory=lambda: SplatartDatamanager)
+    seed_gaussians: int = 0
+    """Number of points inside the silhouettes to start Gaussians from, when the capture has no point cloud."""
+    seed: int = 0
+    """Seed of those points."""
+
+
+class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
+    """Full images of one state of a capture, and points to start Gaussians from."""
+
+    config: SplatartDatamanagerConfig
+
+    def __init__(self, config: SplatartDatamanagerConfig, *args, test_mode: str = "val", **kwargs):
+        super().__init__(config, *args, test_mode=test_mode, **kwargs)
+        if config.seed_gaussians > 0 and test_mode == "val":  # otherwise a checkpoint brings the Gaussians
+            self._add_seed_points()
+
+    @property
+    def capture(self) -> Capture:
+        return self.dataparser.capture
+
+    def _add_seed_points(self) -> None:
+        """Put points where VanillaPipeline looks for them."""
+        state = self.capture.states[self.dataparser.config.state]
+        if state.points is not None:
+            xyz, rgb = load_points(state.points, self.capture.normalization)
+        else:
+            views = [self.train_dataset.get_view(i) for i in range(len(self.train_dataset))]
+            if any(view.alpha is None for view in views):
+                return  # nothing says where the object is: the model starts from random points
+            generator = torch.Generator().manual_seed(self.config.seed)
+            seeds = seed_points(views, len(self.capture.parts), self.config.seed_gaussians, generator)
+            if seeds is None:
+                return
+            xyz, rgb = seeds.xyz, seeds.rgb
+        self.train_dataparser_outputs.metadata.update(points3D_xyz=xyz, points3D_rgb=rgb)
+
+    def _load_images(self, split, cache_images_device):
+        # Pinning needs an accelerator; without one "cpu" and "gpu" are the same memory anyway.
+        return super()._load_images(split, cache_images_device if torch.cuda.is_available() else "gpu")

@@ -1,0 +1,91 @@
+"""Captures as nerfstudio sees them: one state at a time, all states in one normalised world."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.data.scene_box import SceneBox
+
+from splatart_ns.capture.capture import Capture
+from splatart_ns.capture.check import require_valid
+from splatart_ns.capture.images import undistorted_camera
+from splatart_ns.errors import InputError
+
+
+@dataclass
+class SplatartDataParserConfig(DataParserConfig):
+    """An articulated object at two or more states (see the README for the three layouts that are read)."""
+
+    _target: type = field(default_factory=lambda: SplatartDataParser)
+    state: int = 0
+    """Which state of the object, counted from 0 in the order of the state folders."""
+
+
+@dataclass
+class SplatartDataParser(DataParser):
+    """Gives the frames of one state, undistorted, normalised by the similarity that all states share."""
+
+    config: SplatartDataParserConfig
+
+    def __init__(self, config: SplatartDataParserConfig):
+        super().__init__(config)
+        self._capture: Capture | None = None
+
+    @property
+    def capture(self) -> Capture:
+        """The whole capture; checked when it is first read. A user's mistake ends the process with one sentence."""
+        if self._capture is None:
+            try:
+                capture = require_valid(self.config.data)
+                if not 0 <= self.config.state < len(capture.states):
+                    raise InputError(
+                        f"{self.config.data} has no state {self.config.state}; "
+                        f"choose --state between 0 and {len(capture.states) - 1}."
+                    )
+            except InputError as error:
+                print(f"error: {error}", file=sys.stderr)
+                raise SystemExit(2) from None
+            self._capture = capture
+        return self._capture
+
+    def _generate_dataparser_outputs(self, split: str = "train", **_) -> DataparserOutputs:
+        capture = self.capture
+        state = capture.states[self.config.state]
+        frames = state.split(split)
+        if not frames and split != "train":  # nerfstudio needs something to evaluate on
+            frames = state.split("test") or state.split("val") or state.split("train")
+        cameras = [undistorted_camera(f.camera) for f in frames]
+        T = capture.normalization.camera_to_normal(np.stack([f.T_world_camera for f in frames]))
+
+        def column(name: str) -> torch.Tensor:
+            return torch.tensor([getattr(c, name) for c in cameras])
+
+        normalization = capture.normalization
+        return DataparserOutputs(
+            image_filenames=[f.image for f in frames],
+            cameras=Cameras(
+                camera_to_worlds=torch.from_numpy(T[:, :3]).float(),
+                fx=column("fx").float(),
+                fy=column("fy").float(),
+                cx=column("cx").float(),
+                cy=column("cy").float(),
+                width=column("width"),
+                height=column("height"),
+                camera_type=CameraType.PERSPECTIVE,
+            ),
+            scene_box=SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3])),
+            metadata={
+                "frames": frames,
+                "normalization": normalization,
+                "part_names": ["background", *capture.parts.values()],
+            },
+            dataparser_transform=torch.from_numpy(
+                np.concatenate([np.eye(3), -normalization.centre[:, None]], axis=1)
+            ).float(),
+            dataparser_scale=normalization.scale,
+        )

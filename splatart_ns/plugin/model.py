@@ -1,0 +1,183 @@
+"""A Splatfacto that runs with and without CUDA and knows the parts of its Gaussians."""
+
+from __future__ import annotations
+
+import colorsys
+from dataclasses import dataclass, field
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.models.base_model import Model
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from torch import Tensor, nn
+
+from splatart_ns.geometry.camera import viewmat_from_opengl
+from splatart_ns.plugin.gaussians import gauss_params_from_splat, random_splat, splat_from_points
+from splatart_ns.rasterize.render import Rendering, render
+from splatart_ns.rasterize.ssim import ssim
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.semantic import part_image
+
+
+def part_colours(count: int) -> Tensor:
+    """Colours [count + 1, 3] of background (black) and parts, evenly spread hues."""
+    hues = [colorsys.hsv_to_rgb((0.61803 * k) % 1, 0.75, 0.95) for k in range(count)]
+    return torch.tensor([(0.0, 0.0, 0.0), *hues])
+
+
+@dataclass
+class SplatartModelConfig(SplatfactoModelConfig):
+    """What all SPLATART models share."""
+
+    _target: type = field(default_factory=lambda: SplatartModel)
+    num_random: int = 8000
+    """Number of random Gaussians to start from, when neither points nor silhouettes say where the object is."""
+    random_scale: float = 2.0
+    """Side of the cube of random Gaussians; 2 is what the cameras see at the distance of their focus."""
+    background_color: str = "white"
+    """Background of rendered images: random (in training), black or white."""
+    sh_degree: int = 1
+    """Degree of the spherical harmonics; higher ones pay where surfaces shine."""
+    lpips: bool = False
+    """Whether evaluation computes LPIPS, whose weights are downloaded on first use."""
+
+
+class SplatartModel(SplatfactoModel):
+    """Splatfacto with part logits; everything it renders comes out of one rasterization."""
+
+    config: SplatartModelConfig
+
+    def populate_modules(self) -> None:
+        """Gaussians from seed points or at random, strategy and metrics; nothing is downloaded."""
+        names = self.kwargs["metadata"]["part_names"]
+        self.num_parts = len(names) - 1
+        self.part_names = names
+        if self.seed_points is not None and not self.config.random_init:
+            splat = splat_from_points(*self.seed_points, self.config.sh_degree, self.num_parts)
+        else:
+            splat = random_splat(self.config.num_random, self.config.random_scale, self.config.sh_degree, self.num_parts)
+        self.gauss_params = nn.ParameterDict(gauss_params_from_splat(splat))
+        self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
+        self.register_buffer("palette", part_colours(self.num_parts), persistent=False)
+        self.step = 0
+        self.crop_box = None
+        self.background_color = {"black": torch.zeros(3)}.get(self.config.background_color, torch.ones(3))
+
+    @property
+    def splat(self) -> Splat:
+        """The Gaussians, as they are optimised."""
+        p = self.gauss_params
+        return Splat(
+            means=p["means"],
+            quats=p["quats"],
+            log_scales=p["scales"],
+            opacity_logits=p["opacities"][:, 0],
+            sh=torch.cat([p["features_dc"][:, None], p["features_rest"]], dim=1),
+            part_logits=p["semantics"],
+        )
+
+    def get_gaussian_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {name: [parameter] for name, parameter in self.gauss_params.items()}
+
+    def posed_splat(self) -> Splat:
+        """The Gaussians to show."""
+        return self.splat
+
+    def rasterize(self, splat: Splat, camera: Cameras, *, parts: bool, depth: bool) -> Rendering:
+        """Render a splat from one nerfstudio camera, at the training resolution of this step."""
+        poses = camera.camera_to_worlds
+        if self.training:
+            poses = self.camera_optimizer.apply_to_camera(camera)
+        factor = self._get_downscale_factor()
+        camera.rescale_output_resolution(1 / factor)
+        K = camera.get_intrinsics_matrices().to(self.device)
+        width, height = int(camera.width[0].item()), int(camera.height[0].item())
+        camera.rescale_output_resolution(factor)
+        return render(
+            splat,
+            viewmat_from_opengl(poses.to(self.device)),
+            K,
+            width,
+            height,
+            features=splat.part_probabilities if parts else None,
+            with_depth=depth,
+            sh_degree=self.step // self.config.sh_degree_interval,
+            rasterize_mode=self.config.rasterize_mode,
+            absgrad=self.config.use_absgrad and self.training,
+        )
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
+        """rgb, depth, accumulation, background and, outside training, the parts as colours and their confidence."""
+        splat = self.splat if self.training else self.posed_splat()
+        if self.crop_box is not None and not self.training:
+            splat = splat.select(self.crop_box.within(splat.means).reshape(-1))
+        rendering = self.rasterize(
+            splat, camera, parts=not self.training, depth=self.config.output_depth_during_training or not self.training
+        )
+        self.info = rendering.info
+        accumulation = rendering.accumulation[0]
+        background = self._get_background_color()
+        outputs = {
+            "rgb": (rendering.rgb[0] + (1 - accumulation) * background).clamp(0, 1),
+            "accumulation": accumulation,
+            "background": background,
+        }
+        if rendering.depth is not None:
+            depth = rendering.depth[0]
+            outputs["depth"] = torch.where(accumulation > 0, depth, depth.detach().max())
+        if not self.training:
+            probabilities = part_image(rendering)[0]
+            outputs["parts"] = probabilities @ self.palette
+            outputs["part_confidence"] = probabilities.amax(-1, keepdim=True)
+            outputs["background"] = background.expand(*accumulation.shape[:2], 3)
+        return outputs
+
+    def get_metrics_dict(self, outputs, batch) -> dict[str, Tensor]:
+        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        mse = (outputs["rgb"].detach() - target).square().mean()
+        metrics = {"psnr": -10 * mse.clamp_min(1e-10).log10(), "gaussian_count": self.num_points}
+        self.camera_optimizer.get_metrics_dict(metrics)
+        return metrics
+
+    def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """PSNR, SSIM, LPIPS (when asked for) and part IoU of one evaluation image, and pictures to look at."""
+        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        rgb = outputs["rgb"]
+        metrics = {
+            "psnr": float(-10 * (rgb - target).square().mean().clamp_min(1e-10).log10()),
+            "ssim": float(ssim(rgb, target)),
+        }
+        if self.config.lpips:
+            metrics["lpips"] = float(self._lpips()(target.movedim(-1, 0)[None], rgb.movedim(-1, 0)[None]))
+        images = {"img": torch.cat([target, rgb], dim=1), "accumulation": outputs["accumulation"]}
+        if "parts" in outputs:
+            images["parts"] = outputs["parts"]
+        return metrics, images
+
+    def _lpips(self) -> nn.Module:
+        """Built on first use: its constructor downloads weights."""
+        if not hasattr(self, "_lpips_module"):
+            from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+            # Kept out of the module's registry, so that checkpoints do not carry it.
+            object.__setattr__(
+                self, "_lpips_module", LearnedPerceptualImagePatchSimilarity(normalize=True).to(self.device)
+            )
+        return self._lpips_module
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """An output with the accumulation as its alpha [H, W, 4] (`ns-render --output-format rgba`)."""
+        accumulation = outputs["accumulation"]
+        premultiplied = outputs[output_name] - (1 - accumulation) * outputs["background"]
+        colour = (premultiplied / accumulation.clamp_min(1e-3)).clamp(0, 1)
+        return torch.cat([colour, accumulation], dim=-1)
+
+    def load_state_dict(self, state, **kwargs):
+        """Load a checkpoint with any number of Gaussians."""
+        count = state["gauss_params.means"].shape[0]
+        for name, parameter in list(self.gauss_params.items()):
+            saved = state.get(f"gauss_params.{name}")
+            shape = parameter.shape[1:] if saved is None else saved.shape[1:]
+            self.gauss_params[name] = nn.Parameter(torch.zeros(count, *shape, device=self.device))
+        self.step = 30000  # all SH bands are on, as Splatfacto has it
+        return Model.load_state_dict(self, state, **kwargs)

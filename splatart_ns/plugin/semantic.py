@@ -1,0 +1,168 @@
+"""Stage 1 in nerfstudio: one labelled splat of one state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from gsplat.strategy import DefaultStrategy
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from torch import Tensor
+
+from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
+from splatart_ns.rasterize.ssim import l1_ssim_loss
+from splatart_ns.stages.semantic import accumulation_loss, part_image, segmentation_loss, vote_logits
+
+
+@dataclass
+class SemanticModelConfig(SplatartModelConfig):
+    """Splatfacto with an accumulation loss, then a phase in which only the part logits learn."""
+
+    _target: type = field(default_factory=lambda: SemanticModel)
+    semantic_start: int = 1000
+    """Step from which geometry and colour stay as they are and the part logits learn."""
+    accumulation_weight: float = 0.4
+    """Weight of the loss between accumulation and the image's silhouette."""
+    vote_init: bool = True
+    """Whether the logits start from the labels' votes, counted in one backward pass a labelled view."""
+    max_gaussians: int = 20000
+    """Gaussians are not split or duplicated beyond this number."""
+    background_color: str = "random"
+
+
+class SemanticModel(SplatartModel):
+    """Two phases in one run: all but the logits, then the logits alone."""
+
+    config: SemanticModelConfig
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        config = self.config
+        self.strategy = DefaultStrategy(
+            prune_opa=config.cull_alpha_thresh,
+            grow_grad2d=config.densify_grad_thresh,
+            grow_scale3d=config.densify_size_thresh,
+            grow_scale2d=config.split_screen_size,
+            prune_scale3d=config.cull_scale_thresh,
+            prune_scale2d=config.cull_screen_size,
+            refine_scale2d_stop_iter=config.stop_screen_size_at,
+            refine_start_iter=config.warmup_length,
+            refine_stop_iter=min(config.stop_split_at, config.semantic_start),
+            reset_every=config.reset_alpha_every * config.refine_every,
+            refine_every=config.refine_every,
+            pause_refine_after_reset=self.num_train_data + config.refine_every,
+            absgrad=config.use_absgrad,
+            verbose=False,
+        )
+        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
+
+    @property
+    def learns_parts(self) -> bool:
+        """Whether the second phase has begun."""
+        return self.step >= self.config.semantic_start
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
+        if self.training and self.learns_parts:
+            splat = self.splat
+            frozen = splat.detach()
+            frozen.part_logits = splat.part_logits
+            rendering = self.rasterize(frozen, camera, parts=True, depth=False)
+            accumulation = rendering.accumulation[0]
+            background = self._get_background_color()
+            return {
+                "rgb": rendering.rgb[0] + (1 - accumulation) * background,
+                "accumulation": accumulation,
+                "background": background,
+                "part_probabilities": part_image(rendering)[0],
+            }
+        outputs = super().get_outputs(camera)
+        if self.training:
+            self.strategy.grow_grad2d = (
+                self.config.densify_grad_thresh if self.num_points < self.config.max_gaussians else float("inf")
+            )
+            self.strategy.step_pre_backward(
+                self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
+            )
+        return outputs
+
+    def step_post_backward(self, step: int) -> None:
+        if not self.learns_parts:
+            super().step_post_backward(step)
+
+    def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
+        """Colour and accumulation losses in the first phase, cross-entropy of the parts in the second."""
+        if self.training and self.learns_parts:
+            labels = batch["semantics"][..., 0].to(self.device)
+            return {"segmentation": segmentation_loss(outputs["part_probabilities"], self._downscale_labels(labels))}
+        image = self.get_gt_img(batch["image"])
+        target = self.composite_with_background(image, outputs["background"])
+        rgb, accumulation = outputs["rgb"], outputs["accumulation"][..., 0]
+        if "mask" in batch:
+            mask = (self._downscale_if_required(batch["mask"].float()) > 0.5).to(rgb)
+            target, rgb = target * mask, rgb * mask
+        losses = {"main_loss": l1_ssim_loss(rgb, target, self.config.ssim_lambda)}
+        if image.shape[-1] == 4:
+            alpha = image[..., 3]
+            if "mask" in batch:
+                alpha, accumulation = alpha * mask[..., 0], accumulation * mask[..., 0]
+            losses["accumulation"] = self.config.accumulation_weight * accumulation_loss(accumulation, alpha)
+        if self.training:
+            self.camera_optimizer.get_loss_dict(losses)
+        return losses
+
+    def _downscale_labels(self, labels: Tensor) -> Tensor:
+        """Every d-th label: ids must not mix."""
+        d = self._get_downscale_factor()
+        return labels[d // 2 :: d, d // 2 :: d][: labels.shape[0] // d, : labels.shape[1] // d]
+
+
+@dataclass
+class SemanticPipelineConfig(VanillaPipelineConfig):
+    """Stage 1."""
+
+    _target: type = field(default_factory=lambda: SemanticPipeline)
+
+
+class SemanticPipeline(VanillaPipeline):
+    """Lets the second phase see labelled frames only, and starts it from votes."""
+
+    def get_train_loss_dict(self, step: int):
+        if self.model.learns_parts:
+            if not self._labelled():
+                raise RuntimeError("no training frame has labels")
+            camera, batch = self._next_labelled(step)
+            outputs = self._model(camera)
+            return outputs, self.model.get_loss_dict(outputs, batch), self.model.get_metrics_dict(outputs, batch)
+        return super().get_train_loss_dict(step)
+
+    def _labelled(self) -> list[int]:
+        """The training frames with labels."""
+        frames = self.datamanager.train_dataset.metadata["frames"]
+        return [i for i, frame in enumerate(frames) if frame.labels is not None]
+
+    def _next_labelled(self, step: int):
+        """The next labelled frame; frames without labels are passed over."""
+        labelled = set(self._labelled())
+        while True:
+            camera, batch = self.datamanager.next_train(step)
+            if batch["image_idx"] in labelled:
+                return camera, batch
+
+    def get_training_callbacks(self, training_callback_attributes) -> list[TrainingCallback]:
+        callbacks = super().get_training_callbacks(training_callback_attributes)
+        if self.model.config.vote_init:
+            callbacks.append(
+                TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self._vote_at_semantic_start)
+            )
+        return callbacks
+
+    def _vote_at_semantic_start(self, step: int) -> None:
+        if step != self.model.config.semantic_start:
+            return
+        dataset = self.datamanager.train_dataset
+        views = [dataset.get_view(i) for i in self._labelled()]
+        logits = vote_logits(self.model.splat.detach(), views, self.model.num_parts)
+        with torch.no_grad():
+            self.model.gauss_params["semantics"].copy_(logits)

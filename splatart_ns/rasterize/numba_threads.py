@@ -1,0 +1,57 @@
+"""Spreading compiled kernels over threads."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+
+# Kernels are compiled with nogil=True and run in plain Python threads: unlike numba's own threading layers these never
+# spin while torch's OpenMP threads work, and kernels may be started from several threads at once (viewer and training).
+# Sub-normal numbers are rounded as usual, and infinities keep their meaning: only reassociation and contraction.
+JIT = {"nogil": True, "cache": True, "fastmath": {"contract", "reassoc", "nsz", "arcp"}, "error_model": "numpy"}
+
+_pool: ThreadPoolExecutor | None = None
+
+
+def _forget_pool() -> None:
+    global _pool
+    _pool = None
+
+
+if hasattr(os, "register_at_fork"):  # a forked child has the pool object but not its threads
+    os.register_at_fork(after_in_child=_forget_pool)
+
+
+def num_workers() -> int:
+    """Number of threads to use: torch's setting for the calling thread."""
+    return torch.get_num_threads()
+
+
+def run(kernel: Callable, bounds: np.ndarray, *args) -> list:
+    """Calls `kernel(begin, end, worker, *args)` once per interval of `bounds` [workers + 1], at the same time.
+
+    The calling thread takes the first interval. Returns the results in the order of the intervals.
+    """
+    global _pool
+    workers = len(bounds) - 1
+    if workers == 1:
+        return [kernel(bounds[0], bounds[1], 0, *args)]
+    if _pool is None:
+        _pool = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="splatart-raster")
+    futures = [_pool.submit(kernel, bounds[i], bounds[i + 1], i, *args) for i in range(1, workers)]
+    return [kernel(bounds[0], bounds[1], 0, *args)] + [future.result() for future in futures]
+
+
+def even_bounds(count: int, workers: int) -> np.ndarray:
+    """Bounds [workers + 1] of intervals that share `count` items evenly."""
+    return np.linspace(0, count, workers + 1).astype(np.int64)
+
+
+def balanced_bounds(offsets: np.ndarray, workers: int) -> np.ndarray:
+    """Bounds [workers + 1] over items whose costs have the prefix sums `offsets` [items + 1], of even total cost."""
+    goals = offsets[-1] * np.arange(1, workers) / workers
+    return np.concatenate([[0], np.searchsorted(offsets, goals), [len(offsets) - 1]]).astype(np.int64)

@@ -1,0 +1,176 @@
+"""The one entry to rasterization, with the signature and the results of gsplat's `rasterization`."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from splatart_ns.geometry.spherical_harmonics import sh_basis
+from splatart_ns.rasterize import torch_backend
+from splatart_ns.rasterize.projection import project
+
+Backend = Literal["auto", "torch", "numba", "gsplat"]
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+
+
+@functools.cache
+def default_backend(device_type: str | None = None) -> Backend:
+    """The backend that "auto" stands for on a type of device ("cpu", "cuda", ...), by default this machine's best."""
+    if device_type is None:
+        device_type = "cuda" if torch.cuda.is_available() else "cpu"
+    if device_type == "cuda":
+        return "gsplat"
+    return "numba" if device_type == "cpu" and importlib.util.find_spec("numba") is not None else "torch"
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = False,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: RenderMode = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    covars: Tensor | None = None,
+    backend: Backend = "auto",
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render N Gaussians into C pinhole images. Arguments are those of gsplat 1.4.0, plus `backend`.
+
+    Args:
+        means: Centres [N, 3], world.
+        quats: Rotations [N, 4], wxyz, of any norm.
+        scales: Standard deviations [N, 3].
+        opacities: [N] in [0, 1].
+        colors: Channels [N, D] or [C, N, D] as they are; with `sh_degree`, spherical harmonics coefficients
+            [N, K, 3] or [C, N, K, 3], of which the first (sh_degree + 1)^2 count; the colour is max(0, 0.5 + sum).
+        viewmats: World-to-camera transforms [C, 4, 4], OpenCV axes. Differentiable.
+        Ks: Intrinsics [C, 3, 3], pixels.
+        width, height: Image size.
+        near_plane, far_plane, radius_clip, eps2d: See `project`.
+        backgrounds: What shows through [C, D]; black when not given. The background's depth is 0.
+        render_mode: Channels of the image: "RGB" the colours, "D" accumulated depth, "ED" expected depth
+            (accumulated over alpha), or colours then depth.
+        absgrad: Let backward set `info["means2d"].absgrad`.
+        rasterize_mode: "antialiased" keeps the mass of Gaussians that `eps2d` blurs (Mip-Splatting).
+        packed, tile_size, sparse_grad, channel_chunk: Ignored; results are never packed.
+        distributed, camera_model, covars: Only gsplat's defaults are supported.
+        backend: "gsplat" (CUDA), "numba" (CPU, float32), "torch" (any device), or "auto": the first of these for the
+            device of `means`, and torch for float64.
+
+    Returns:
+        The image [C, H, W, D], [C, H, W, 1] or [C, H, W, D + 1]; its alpha [C, H, W, 1]; and `info`, the intermediate
+        results under gsplat's names: means2d (a tensor of the graph), radii (0 = culled), depths, conics, opacities
+        (compensated), camera_ids and gaussian_ids (None), width, height, n_cameras, tile_size, tile_width, tile_height.
+
+    Raises:
+        NotImplementedError: For a camera model but pinhole, distributed rendering or given covariances.
+    """
+    for name, is_default in (
+        (f"camera_model={camera_model!r}", camera_model == "pinhole"),
+        ("distributed=True", not distributed),
+        ("covars", covars is None),
+    ):
+        if not is_default:
+            raise NotImplementedError(f"rasterization: {name} is not supported")
+    if backend == "auto":
+        backend = "torch" if means.dtype == torch.float64 else default_backend(means.device.type)
+
+    if backend == "gsplat":
+        import gsplat
+
+        return gsplat.rasterization(
+            *(means, quats, scales, opacities, colors, viewmats, Ks, width, height),
+            near_plane=near_plane,
+            far_plane=far_plane,
+            radius_clip=radius_clip,
+            eps2d=eps2d,
+            sh_degree=sh_degree,
+            packed=False,
+            backgrounds=backgrounds,
+            render_mode=render_mode,
+            absgrad=absgrad,
+            rasterize_mode=rasterize_mode,
+        )
+
+    C, N = len(viewmats), len(means)
+    radii, means2d, depths, conics, compensations = project(
+        *(means, quats, scales, viewmats, Ks, width, height, eps2d, near_plane, far_plane, radius_clip)
+    )
+    opacities = opacities.expand(C, N)
+    if rasterize_mode == "antialiased":
+        opacities = opacities * compensations
+    if sh_degree is not None:
+        colors = sh_colors(means, colors, viewmats, sh_degree)
+
+    with_depth, with_color = render_mode.endswith("D"), render_mode.startswith("RGB")
+    channels = [colors.expand(C, -1, -1)] if with_color else []
+    if with_depth:
+        channels.append(depths[..., None])
+    image, alphas = _compositor(backend)(
+        *(means2d, conics, opacities, torch.cat(channels, -1), depths, radii > 0, width, height, absgrad)
+    )
+    if render_mode.endswith("ED"):
+        depth = image[..., -1:] / alphas.clamp_min(1e-10)
+        image = torch.cat([image[..., :-1], depth], -1)
+    if backgrounds is not None and with_color:
+        behind = (1 - alphas) * backgrounds[:, None, None]
+        image = image + (torch.nn.functional.pad(behind, (0, 1)) if with_depth else behind)
+    info = {
+        "camera_ids": None,
+        "gaussian_ids": None,
+        "radii": radii,
+        "means2d": means2d,
+        "depths": depths,
+        "conics": conics,
+        "opacities": opacities,
+        "width": width,
+        "height": height,
+        "n_cameras": C,
+        "tile_size": torch_backend.TILE,
+        "tile_width": -(-width // torch_backend.TILE),
+        "tile_height": -(-height // torch_backend.TILE),
+    }
+    return image, alphas, info
+
+
+def sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int) -> Tensor:
+    """Colours [C, N, 3] seen from the cameras `viewmats` [C, 4, 4] of Gaussians with coefficients `sh`.
+
+    `sh` is [N, K, 3] or [C, N, K, 3], K >= (degree + 1)^2.
+    """
+    R, t = viewmats[:, :3, :3], viewmats[:, :3, 3:]
+    camera = -(R.mT @ t)[..., 0]
+    dirs = torch.nn.functional.normalize(means - camera[:, None], dim=-1)
+    basis = sh_basis(dirs, degree)
+    return ((basis[..., None] * sh[..., : basis.shape[-1], :]).sum(-2) + 0.5).clamp_min(0)
+
+
+def _compositor(backend: Backend):
+    if backend == "numba":
+        from splatart_ns.rasterize import numba_backend
+
+        return numba_backend.rasterize_to_pixels
+    if backend == "torch":
+        return torch_backend.rasterize_to_pixels
+    raise ValueError(f"unknown rasterization backend {backend!r}: use auto, torch, numba or gsplat")

@@ -1,0 +1,58 @@
+"""Where two parts touch, and whether they stay in touch while they move."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from splatart_ns.geometry.se3 import inverse, transform_points
+
+_MAX_POINTS = 2000
+_TOUCHING = 0.01  # share of a part's points that counts as its contact
+
+
+@dataclass(frozen=True)
+class Contact:
+    """How close two parts stay."""
+
+    gap: float
+    """1st percentile of the distances from one part's points to the other part, the largest over the states."""
+    points: Tensor
+    """The points [K, 3] of either part that stay closest to the other in all states, canonical frame."""
+
+    def distance_to_axis(self, axis: Tensor, origin: Tensor) -> float:
+        """Median distance of the contact from the line through `origin` [3] along the unit vector `axis` [3]."""
+        across = torch.linalg.cross(self.points - origin, axis.expand_as(self.points))
+        return float(torch.linalg.vector_norm(across, dim=-1).median())
+
+
+def find_contacts(points: dict[int, Tensor], motions: dict[int, Tensor]) -> dict[tuple[int, int], Contact]:
+    """Contacts of all pairs (a, b), a < b, of parts with points [N, 3] at state 0 and motions [S, 4, 4].
+
+    Of a part with more than 2000 points, evenly picked ones are used.
+    """
+    sampled = {p: x[:: math.ceil(len(x) / _MAX_POINTS)].double() for p, x in points.items()}
+    trees = {p: cKDTree(x.numpy(force=True)) for p, x in sampled.items()}
+    pairs = [(a, b) for a in sorted(points) for b in sorted(points) if a < b]
+    return {
+        (a, b): _contact(sampled[a], sampled[b], trees[a], trees[b], inverse(motions[a].double()) @ motions[b].double())
+        for a, b in pairs
+    }
+
+
+def _contact(points_a: Tensor, points_b: Tensor, tree_a: cKDTree, tree_b: cKDTree, T_a_b: Tensor) -> Contact:
+    from_b = tree_a.query(transform_points(T_a_b, points_b).numpy(force=True))[0]  # [S, N]
+    from_a = tree_b.query(transform_points(inverse(T_a_b), points_a).numpy(force=True))[0]
+    share = 100 * _TOUCHING
+    # From the side whose contact is the larger share: a small part's foot is lost among the points of a large one.
+    gap = np.minimum(np.percentile(from_a, share, axis=1), np.percentile(from_b, share, axis=1)).max()
+    staying = []
+    for points, distances in ((points_a, from_a), (points_b, from_b)):
+        count = max(1, round(_TOUCHING * len(points)))
+        staying.append(points[torch.from_numpy(distances.max(0).argsort()[:count]).to(points.device)])
+    return Contact(float(gap), torch.cat(staying))

@@ -1,0 +1,127 @@
+"""Where Gaussians start: points inside the visual hull of the silhouettes, each part with its share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from splatart_ns.capture.capture import UNLABELLED
+from splatart_ns.capture.view import View
+
+MIN_POINTS_PER_PART = {2: 2000, 6: 1000}
+"""Least number of points of a part, by the number of parts up to which it holds (POSES.md, section 7)."""
+MIN_POINTS_OTHERWISE = 350
+
+
+@dataclass(frozen=True)
+class SeedPoints:
+    """Points to start Gaussians from, in the normalised world."""
+
+    xyz: Tensor
+    """[N, 3]."""
+    rgb: Tensor
+    """[N, 3] in 0..255, nerfstudio's convention for seed points."""
+
+
+def carve(views: Sequence[View], grid: Tensor, dilate: int) -> Tensor:
+    """Which points [N, 3] lie inside every silhouette that sees them (and are seen at all): [N] bool.
+
+    `dilate` widens the silhouettes by so many pixels.
+    """
+    inside = torch.ones(len(grid), dtype=torch.bool)
+    seen = torch.zeros(len(grid), dtype=torch.bool)
+    for view in views:
+        silhouette = (view.alpha.float() / 255 > 0.5).float()[None, None]
+        if dilate > 0:
+            silhouette = F.max_pool2d(silhouette, 2 * dilate + 1, stride=1, padding=dilate)
+        u, v, visible = _project(view, grid)
+        seen |= visible
+        inside &= ~visible | (silhouette[0, 0, v, u] > 0)
+    return inside & seen
+
+
+def _project(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixel column and row [N] (clamped into the image) and whether the point falls into it."""
+    x = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    z = x[:, 2].clamp_min(1e-6)
+    u = (view.K[0, 0] * x[:, 0] / z + view.K[0, 2]).floor()
+    v = (view.K[1, 1] * x[:, 1] / z + view.K[1, 2]).floor()
+    visible = (x[:, 2] > 1e-6) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
+    return u.clamp(0, view.width - 1).long(), v.clamp(0, view.height - 1).long(), visible
+
+
+def visual_hull(views: Sequence[View], resolution: int = 96) -> tuple[Tensor, float] | None:
+    """Centres [N, 3] of the occupied voxels and the voxels' size; None when no voxel is occupied.
+
+    Two passes: a coarse one finds the object's box, a fine one of `resolution` voxels along the longest side fills it.
+    """
+    low, high = torch.full((3,), -1.5), torch.full((3,), 1.5)
+    for count in (48, resolution):
+        size = float((high - low).max()) / count
+        axes = [torch.arange(float(a) + size / 2, float(b), size) for a, b in zip(low, high, strict=True)]
+        grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
+        # Half a voxel's diagonal in pixels, so that no thin part falls between the voxel centres.
+        pixels = max(float(v.K[0, 0] / v.viewmat[:3, 3].norm().clamp_min(0.1)) for v in views) * size * 0.87
+        grid = grid[carve(views, grid, dilate=round(pixels) if count != resolution else round(pixels / 2))]
+        if len(grid) == 0:
+            return None
+        low, high = grid.amin(0) - size, grid.amax(0) + size
+    return grid, size
+
+
+def seed_points(
+    views: Sequence[View], num_parts: int, count: int, generator: torch.Generator, resolution: int = 96
+) -> SeedPoints | None:
+    """`count` points inside the visual hull, parts below a least number filled up; None without a hull.
+
+    Every view needs its alpha. A point's part is the label that most labelled views give it, its colour the mean over
+    the views in which it has that label. The least number keeps small parts from starving (POSES.md, section 1).
+    """
+    hull = visual_hull(views, resolution)
+    if hull is None:
+        return None
+    voxels, size = hull
+    labels = vote_by_projection(views, voxels, num_parts)
+
+    def draw(pool: Tensor, number: int) -> Tensor:
+        index = pool[torch.randint(len(pool), (number,), generator=generator)]
+        return voxels[index] + size * (torch.rand(number, 3, generator=generator) - 0.5)
+
+    least = next((n for limit, n in MIN_POINTS_PER_PART.items() if num_parts <= limit), MIN_POINTS_OTHERWISE)
+    points = [draw(torch.arange(len(voxels)), count)]
+    for part in range(1, num_parts + 1):
+        pool = (labels == part).nonzero()[:, 0]
+        missing = least - round(count * len(pool) / len(voxels))
+        if len(pool) > 0 and missing > 0:
+            points.append(draw(pool, missing))
+    xyz = torch.cat(points)
+    return SeedPoints(xyz, _mean_colours(views, xyz))
+
+
+def vote_by_projection(views: Sequence[View], points: Tensor, num_parts: int) -> Tensor:
+    """The part that most labelled views show where a point projects [N]; 0 where no view shows one."""
+    votes = torch.zeros(len(points), num_parts + 1)
+    rows = torch.arange(len(points))
+    for view in views:
+        if view.labels is None:
+            continue
+        u, v, visible = _project(view, points)
+        label = view.labels[v, u].long()
+        counts = visible & (label != UNLABELLED) & (label > 0)
+        votes[rows[counts], label[counts]] += 1
+    return votes.argmax(-1)
+
+
+def _mean_colours(views: Sequence[View], points: Tensor) -> Tensor:
+    """Mean colour [N, 3], 0..255, over the views in whose silhouette a point falls; grey where there is none."""
+    total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
+    for view in views:
+        u, v, visible = _project(view, points)
+        inside = (visible & (view.alpha[v, u] > 127)).float()[:, None]
+        total += inside * view.rgb[v, u].float()
+        weight += inside
+    return torch.where(weight > 0, total / weight.clamp_min(1), torch.full_like(total, 127.5))

@@ -1,0 +1,203 @@
+"""One part in two states: what the images of each state say of the other state's Gaussians, moved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from splatart_ns.capture.capture import UNLABELLED
+from splatart_ns.capture.view import View
+from splatart_ns.geometry.se3 import inverse
+from splatart_ns.rasterize.rasterization import rasterization, sh_colors
+from splatart_ns.splats.splat import Splat
+
+RGB_WEIGHT = 0.3
+"""Weight of a colour difference against one of silhouettes: the pose is in the shape, light misleads."""
+HUBER = 0.15
+"""Residuals beyond this count linearly."""
+MARGIN = 8
+"""Least margin in pixels around a part in the piece of the image that is compared."""
+
+
+@dataclass(frozen=True)
+class PartView:
+    """The piece of an image around a part, made smaller by `factor`."""
+
+    viewmat: Tensor
+    """World to camera [4, 4] float32."""
+    K: Tensor
+    """Intrinsics of the piece [3, 3]."""
+    rgba: Tensor
+    """The part over black with its silhouette [H, W, 4], 0..1."""
+    weight: Tensor
+    """Which pixels count [H, W], 0..1: the part and the background. Another part may hide this one, so its pixels do
+    not, nor do those without a label."""
+    area: float
+    """Number of the part's own pixels at full size."""
+    factor: int
+
+    def render(self, splat: Splat, T: Tensor) -> Tensor:
+        """The splat under motions [K, 4, 4]: [K, H, W, 4], colours over black and accumulation.
+
+        A splat moved by T looks to a camera V as the unmoved one does to V T.
+        """
+        viewmats = self.viewmat @ T.to(self.viewmat)
+        height, width = self.weight.shape
+        image, accumulation, _ = rasterization(
+            splat.means,
+            splat.quats,
+            splat.scales,
+            splat.opacities,
+            sh_colors(splat.means, splat.sh, viewmats, splat.sh_degree),
+            viewmats,
+            self.K.expand(len(viewmats), 3, 3),
+            width,
+            height,
+            # The blur of 0.3 pixels^2 of the full image, and what averaging its pixels adds.
+            eps2d=0.3 / self.factor**2 + (1 - 1 / self.factor**2) / 12,
+        )
+        return torch.cat([image, accumulation], -1)
+
+
+def part_view(view: View, part: int, factor: int = 1, device: torch.device | None = None) -> PartView | None:
+    """What `view` says of a part; None if it says nothing.
+
+    An unlabelled view tells only where the background is, and only if it has an alpha.
+    """
+    if view.labels is not None:
+        own, background = view.labels == part, view.labels == 0
+        unlabelled = view.labels == UNLABELLED
+    elif view.alpha is not None:
+        own = torch.zeros_like(view.alpha, dtype=torch.bool)
+        background = view.alpha == 0
+        unlabelled = ~background
+    else:
+        return None
+    alpha = own.float() if view.alpha is None else view.alpha.float() / 255
+    weight = ((own | background) & ~unlabelled).float()
+    if view.mask is not None:
+        weight = weight * view.mask
+    if not (weight * own).any() and view.labels is not None:
+        return None
+    rgba = torch.cat([view.rgb.float() / 255 * alpha[..., None], alpha[..., None]], -1)
+
+    left, top, right, bottom = _window(own if own.any() else weight > 0, factor)
+    rgba, weight = rgba[top:bottom, left:right], weight[top:bottom, left:right]
+    K = view.K.clone()
+    K[0, 2] -= left
+    K[1, 2] -= top
+    K[:2] /= factor
+    pieces = torch.cat([rgba * weight[..., None], weight[..., None]], -1)
+    pieces = F.avg_pool2d(pieces.permute(2, 0, 1)[None], factor)[0].permute(1, 2, 0)
+    weight = pieces[..., 4]
+    return PartView(
+        viewmat=view.viewmat.to(device),
+        K=K.to(device),
+        rgba=(pieces[..., :4] / weight.clamp_min(1e-6)[..., None]).to(device),
+        weight=weight.to(device),
+        area=float(own.sum()),
+        factor=factor,
+    )
+
+
+def _window(shown: Tensor, factor: int) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of the box of `shown` [H, W] with a margin, a multiple of `factor` wide and high."""
+    bounds = []
+    for along, size in ((shown.any(0), shown.shape[1]), (shown.any(1), shown.shape[0])):
+        inside = along.nonzero()
+        low, high = int(inside.min()), int(inside.max()) + 1
+        margin = max(MARGIN, (high - low) // 2)
+        low, high = max(0, low - margin), min(size, high + margin)
+        bounds.append((low, low + max(1, (high - low) // factor) * factor))
+    (left, right), (top, bottom) = bounds
+    return left, top, right, bottom
+
+
+def best_views(views: Sequence[View], part: int, count: int) -> list[View]:
+    """Up to `count` views that show a part well, from directions far apart (farthest point sampling).
+
+    Only where labelled views are fewer, unlabelled ones with an alpha join them. Empty if no label shows the part.
+    """
+    area = torch.tensor([0 if v.labels is None else int((v.labels == part).sum()) for v in views])
+    if not (area > 0).any():
+        return []
+    silhouette = torch.tensor([v.labels is None and v.alpha is not None for v in views])
+    centres = torch.stack([inverse(v.viewmat)[:3, 3] for v in views])
+    chosen = [int(area.argmax())]
+    for usable in (area > 0.25 * area.max(), silhouette):
+        pool = [int(i) for i in usable.nonzero()[:, 0] if int(i) not in chosen]
+        while len(chosen) < count and pool:
+            distance = torch.cdist(centres[pool], centres[chosen]).amin(1)
+            chosen.append(pool.pop(int(distance.argmax())))
+    return [views[i] for i in chosen]
+
+
+@dataclass(frozen=True)
+class PartPair:
+    """One part's Gaussians in two states, and views of both states."""
+
+    splats: tuple[Splat, Splat]
+    """The part alone in the source and in the target state."""
+    views: tuple[tuple[PartView, ...], tuple[PartView, ...]]
+    """Views of the source and of the target state."""
+    centroid: Tensor
+    """Of the part in the source state [3] float64."""
+    radius: float
+    """Root mean square distance of the part's Gaussians from the centroid."""
+
+    @property
+    def area(self) -> float:
+        """The part's own pixels in all views, at the size at which they are compared."""
+        return sum(v.area / v.factor**2 for views in self.views for v in views)
+
+    def residuals(self, T: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """View by view, the differences [K, H, W, 4] under motions T [K, 4, 4] and the pixels' weights [H, W].
+
+        First the source's Gaussians moved by T in the target's views, then the target's moved back in the source's.
+        """
+        for splat, views, motion in zip(self.splats, reversed(self.views), (T, inverse(T)), strict=True):
+            for view in views:
+                difference = view.render(splat, motion) - view.rgba
+                difference[..., :3] *= RGB_WEIGHT
+                yield difference, view.weight
+
+    @torch.no_grad()
+    def cost(self, T: Tensor) -> Tensor:
+        """Mean Huber cost per own pixel of motions T [K, 4, 4]: [K] float64."""
+        total = torch.zeros(len(T), dtype=torch.float64, device=T.device)
+        for difference, weight in self.residuals(T):
+            total += (huber(difference).sum(-1) * weight).sum((1, 2)).double()
+        return total / max(self.area, 1.0)
+
+
+def huber(r: Tensor) -> Tensor:
+    a = r.abs()
+    return torch.where(a < HUBER, 0.5 * r * r, HUBER * (a - 0.5 * HUBER))
+
+
+def part_pair(
+    splats: tuple[Splat, Splat], views: tuple[Sequence[View], Sequence[View]], part: int, num_views: int, pixels: int
+) -> PartPair | None:
+    """Compare a part in about `num_views` views of each state, in which it covers about `pixels` pixels or fewer.
+
+    None when no labelled view of either state shows the part.
+    """
+    parts = tuple(s.select(s.part_ids == part).detach() for s in splats)
+    device = parts[0].means.device
+    pieces = []
+    for state_views in views:
+        chosen = best_views(state_views, part, num_views)
+        areas = [float((v.labels == part).sum()) for v in chosen if v.labels is not None]
+        factor = max(1, int((sum(areas) / max(1, len(areas)) / pixels) ** 0.5))
+        pieces.append(tuple(p for v in chosen if (p := part_view(v, part, factor, device)) is not None))
+    if not pieces[0] and not pieces[1]:
+        return None
+    means = parts[0].means.double()
+    weight = (parts[0].opacities * parts[0].part_probabilities[:, part]).double()
+    centroid = weight @ means / weight.sum()
+    radius = float((weight @ (means - centroid).square().sum(1) / weight.sum()).sqrt())
+    return PartPair(parts, (pieces[0], pieces[1]), centroid, radius)

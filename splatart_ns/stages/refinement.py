@@ -1,0 +1,123 @@
+"""The motion of one part refined by Gauss-Newton on rendered images, and how certain it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from splatart_ns.geometry.se3 import from_rotation_translation, skew, so3_exp, transform_points
+from splatart_ns.stages.part_pair import HUBER, PartPair
+
+STEP = 4e-3
+"""Forward differences: radians, and part radii."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Where Gauss-Newton ended."""
+
+    T: Tensor
+    """The motion [4, 4] float64."""
+    cost: float
+    """Mean Huber cost per own pixel."""
+    covariance: Tensor
+    """Of the motion [6, 6] float64, tangent (translation, rotation): T = se3_exp(xi) T_true, in the world frame."""
+    converged: bool
+    iterations: int
+
+
+def increment(T: Tensor, xi: Tensor, centroid: Tensor, radius: float) -> Tensor:
+    """Motions [..., 4, 4] after a small motion xi [..., 6]: translation in radii, then rotation about the moved centroid."""
+    pivot = transform_points(T, centroid[None])[..., 0, :]
+    R = so3_exp(xi[..., 3:])
+    small = from_rotation_translation(R, pivot + radius * xi[..., :3] - (R @ pivot[..., None])[..., 0])
+    return small @ T
+
+
+def refine(pair: PartPair, T: Tensor, max_iterations: int = 6, hold_rotation: bool = False) -> Refinement:
+    """Levenberg-Marquardt from T [4, 4] on all pixels of the pair, robust by Huber weights.
+
+    `hold_rotation` moves only the translation; the covariance of the rotation is then 0.
+    """
+    T = T.double()
+    n = 3 if hold_rotation else 6
+    damping, converged = 1e-3, False
+    equations = _normal_equations(pair, T, n)
+    iteration = 0
+    while iteration < max_iterations and not converged:
+        iteration += 1
+        H = equations.H + damping * equations.H.diagonal().clamp_min(1e-12).diag()
+        step = -torch.linalg.solve(H, equations.g.sum(0))
+        trial = increment(T, torch.nn.functional.pad(step, (0, 6 - n)), pair.centroid, pair.radius)
+        cost = float(pair.cost(trial[None])[0])
+        if cost < equations.cost:
+            converged = bool(step.abs().max() < 0.1 * STEP) or cost > (1 - 1e-4) * equations.cost
+            T, damping = trial, damping * 0.3
+            equations = _normal_equations(pair, T, n)
+        else:
+            damping = max(damping, 1e-3) * 10
+            converged = damping > 1e2 or bool(step.abs().max() < 0.1 * STEP)
+    return Refinement(T, equations.cost, _covariance(pair, T, equations), converged, iteration)
+
+
+@dataclass(frozen=True)
+class _NormalEquations:
+    """Of the Huber cost, in units of radii and radians."""
+
+    H: Tensor
+    """[n, n]."""
+    g: Tensor
+    """Of each view [V, n]."""
+    cost: float
+
+
+@torch.no_grad()
+def _normal_equations(pair: PartPair, T: Tensor, n: int) -> _NormalEquations:
+    steps = torch.nn.functional.pad(STEP * torch.eye(n, dtype=T.dtype, device=T.device), (0, 6 - n, 1, 0))
+    motions = increment(T.expand(n + 1, 4, 4), steps, pair.centroid, pair.radius)
+    H = torch.zeros(n, n, dtype=T.dtype, device=T.device)
+    gradients = []
+    cost = 0.0
+    for difference, weight in pair.residuals(motions):
+        r = difference[0].reshape(-1)
+        J = (difference[1:].reshape(n, -1) - r) / STEP
+        w = weight[..., None].expand(difference.shape[1:]).reshape(-1)
+        size = r.abs().clamp_min(1e-12)
+        wJ = J * (w * (HUBER / size).clamp_max(1.0))
+        H += (wJ @ J.T).double()
+        gradients.append((wJ @ r).double())
+        cost += float((w * torch.where(size < HUBER, 0.5 * r * r, HUBER * (size - 0.5 * HUBER))).sum())
+    return _NormalEquations(H, torch.stack(gradients), cost / max(pair.area, 1.0))
+
+
+def _covariance(pair: PartPair, T: Tensor, equations: _NormalEquations) -> Tensor:
+    """Sandwich estimate with the views as clusters [6, 6] (Liang and Zeger 1986).
+
+    Neighbouring pixels err together (edges, shadows, a mixed Gaussian), so each view counts as one observation, however
+    many pixels it has.
+    """
+    V, n = equations.g.shape
+    H_inv = torch.linalg.pinv(equations.H, hermitian=True)
+    meat = equations.g.T @ equations.g * (V / max(V - 1, 1))
+    local = torch.zeros(6, 6, dtype=T.dtype, device=T.device)
+    local[:n, :n] = H_inv @ meat @ H_inv
+    # From (radii, radians) about the moved centroid to the world's origin.
+    A = torch.eye(6, dtype=T.dtype, device=T.device)
+    A[:3, :3] *= pair.radius
+    A[:3, 3:] = skew(transform_points(T, pair.centroid[None])[0])
+    return A @ local @ A.T
+
+
+def rotation_held_ratio(pair: PartPair, T: Tensor, R: Tensor) -> float:
+    """How much worse a part fits when it may only slide: cost with the rotation held at R [3, 3] over cost free.
+
+    `T` [4, 4] is the free solution; the held one starts with the part's centroid where T puts it. Near 1 for a part that
+    slides, above 5 for one that turns (POSES.md, section 3); 1.2 separates them.
+    """
+    free = refine(pair, T)
+    moved = transform_points(free.T, pair.centroid[None])[0]
+    R = R.to(free.T)
+    held = refine(pair, from_rotation_translation(R, moved - R @ pair.centroid), hold_rotation=True)
+    return held.cost / max(free.cost, 1e-12)

@@ -1,0 +1,158 @@
+"""Where a part of one state may lie in another state: trimmed ICP on points and colours, from many starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from splatart_ns.splats.splat import Splat
+
+MIN_POINTS = 8
+"""A part with fewer Gaussians than this in a state cannot be registered."""
+SAMPLES = 500
+"""Source points that follow each start."""
+RANDOM_STARTS = 40
+ITERATIONS = 25
+TRIM = 0.15
+"""Share of the worst correspondences that each step leaves out: what only one of the states shows."""
+COLOUR = 0.3
+"""Colour difference (0 to 1) of one counts as this many part radii."""
+MIN_OPACITY = 0.1
+
+
+@dataclass(frozen=True)
+class PartPoints:
+    """One part's Gaussians as ICP sees them."""
+
+    xyz: np.ndarray
+    """Centres [N, 3] float64."""
+    rgb: np.ndarray
+    """Colours of the constant band [N, 3], about 0 to 1."""
+    weight: np.ndarray
+    """Opacity times the probability of the part [N]: low for hidden and for mixed Gaussians."""
+
+    @property
+    def centroid(self) -> np.ndarray:
+        return self.weight @ self.xyz / self.weight.sum()
+
+    @property
+    def radius(self) -> float:
+        """Root mean square distance from the centroid."""
+        return float(np.sqrt(self.weight @ ((self.xyz - self.centroid) ** 2).sum(1) / self.weight.sum()))
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Distinct motions T [C, 4, 4] that bring the source onto the target, best fit first."""
+
+    T: np.ndarray
+    fit: np.ndarray
+    """Trimmed mean distance, both ways, of points and colours [C], length. Flat parts fit alike when turned over, so
+    this ranks candidates but must not choose among them (see render_choice)."""
+
+
+def part_points(splat: Splat, part: int) -> PartPoints:
+    """The Gaussians whose most likely part is `part`, without the nearly transparent ones."""
+    part_splat = splat.select((splat.part_ids == part) & (splat.opacities > MIN_OPACITY)).detach().to("cpu")
+    # 0.28209 is the constant spherical harmonic.
+    rgb = 0.5 + 0.28209479177387814 * part_splat.sh[:, 0].double().numpy()
+    weight = part_splat.opacities * part_splat.part_probabilities[:, part]
+    return PartPoints(part_splat.means.double().numpy(), rgb, weight.double().numpy())
+
+
+def register(source: PartPoints, target: PartPoints, seed: int = 0, keep: int = 10) -> Registration:
+    """Candidates for the motion of a part, at most `keep`, which differ by 6 degrees or 6 % of the radius or more.
+
+    Starts: no motion, centroid on centroid with no turn, with the four proper alignments of the principal axes, and
+    with random turns. All starts are followed together. Needs `MIN_POINTS` points on both sides.
+    """
+    rng = np.random.default_rng(seed)
+    colour = COLOUR * target.radius
+    source_tree = cKDTree(_features(source, colour))
+    target_tree = cKDTree(_features(target, colour))
+    sample, back_sample = _sample(source, rng), _sample(target, rng)
+
+    T = _starts(source, target, rng)
+    for _ in range(ITERATIONS):
+        T = _icp_step(T, sample, colour, target, target_tree)
+    forth = _trimmed_distance(T, sample, colour, target_tree)
+    back = _trimmed_distance(np.linalg.inv(T), back_sample, colour, source_tree)
+    fit = (forth + back) / 2
+    chosen = distinct(T, fit, source.centroid, source.radius)[:keep]
+    return Registration(T[chosen], fit[chosen])
+
+
+def distinct(T: np.ndarray, cost: np.ndarray, centroid: np.ndarray, radius: float) -> list[int]:
+    """Indices of motions [C, 4, 4] by rising cost, without those nearly equal to a cheaper one.
+
+    Nearly equal: less than 6 degrees apart, and less than 6 % of `radius` at `centroid`.
+    """
+    chosen: list[int] = []
+    for i in np.argsort(cost, kind="stable"):
+        D = T[chosen]
+        cosine = (np.einsum("kij,ij->k", D[:, :3, :3], T[i, :3, :3]) - 1) / 2
+        moved = np.linalg.norm((D[:, :3] - T[i, :3]) @ np.append(centroid, 1.0), axis=-1)
+        if not np.any((cosine > np.cos(np.radians(6))) & (moved < 0.06 * radius)):
+            chosen.append(int(i))
+    return chosen
+
+
+def _features(points: PartPoints, colour: float) -> np.ndarray:
+    return np.concatenate([points.xyz, colour * points.rgb], axis=1)
+
+
+def _sample(points: PartPoints, rng: np.random.Generator) -> PartPoints:
+    if len(points.xyz) <= SAMPLES:
+        return points
+    chosen = rng.choice(len(points.xyz), SAMPLES, replace=False, p=points.weight / points.weight.sum())
+    return PartPoints(points.xyz[chosen], points.rgb[chosen], points.weight[chosen])
+
+
+def _starts(source: PartPoints, target: PartPoints, rng: np.random.Generator) -> np.ndarray:
+    """[K, 4, 4]."""
+
+    def axes(points: PartPoints) -> np.ndarray:
+        centred = points.xyz - points.centroid
+        V = np.linalg.eigh((points.weight[:, None] * centred).T @ centred)[1]
+        return V * np.linalg.det(V)
+
+    signs = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    principal = (axes(target) * signs[:, None]) @ axes(source).T
+    R = np.concatenate([np.eye(3)[None], principal, Rotation.random(RANDOM_STARTS, random_state=rng).as_matrix()])
+    T = np.tile(np.eye(4), (len(R), 1, 1))
+    T[:, :3, :3] = R
+    T[:, :3, 3] = target.centroid - R @ source.centroid
+    return np.concatenate([np.eye(4)[None], T])
+
+
+def _moved_features(T: np.ndarray, sample: PartPoints, colour: float) -> np.ndarray:
+    xyz = sample.xyz @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]
+    return np.concatenate([xyz, np.broadcast_to(colour * sample.rgb, xyz.shape)], axis=2)
+
+
+def _icp_step(
+    T: np.ndarray, sample: PartPoints, colour: float, target: PartPoints, target_tree: cKDTree
+) -> np.ndarray:
+    """One step of every motion: nearest points, trimming, the rigid fit (Kabsch 1976)."""
+    distance, nearest = target_tree.query(_moved_features(T, sample, colour))
+    inlier = distance <= np.quantile(distance, 1 - TRIM, axis=1, keepdims=True)
+    w = inlier / inlier.sum(axis=1, keepdims=True)
+    goal = target.xyz[nearest]
+    source_mean, goal_mean = w @ sample.xyz, (w[..., None] * goal).sum(axis=1)
+    H = (w[..., None] * (sample.xyz - source_mean[:, None])).swapaxes(1, 2) @ (goal - goal_mean[:, None])
+    U, _, Vh = np.linalg.svd(H)
+    flip = np.ones(U.shape[:2])
+    flip[:, 2] = np.linalg.det(U @ Vh)
+    R = (Vh.swapaxes(1, 2) * flip[:, None]) @ U.swapaxes(1, 2)
+    out = np.tile(np.eye(4), (len(T), 1, 1))
+    out[:, :3, :3] = R
+    out[:, :3, 3] = goal_mean - (R @ source_mean[..., None])[..., 0]
+    return out
+
+
+def _trimmed_distance(T: np.ndarray, sample: PartPoints, colour: float, tree: cKDTree) -> np.ndarray:
+    distance = np.sort(tree.query(_moved_features(T, sample, colour))[0], axis=1)
+    return distance[:, : max(1, round((1 - TRIM) * distance.shape[1]))].mean(axis=1)
