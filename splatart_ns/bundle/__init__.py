@@ -1,0 +1,29 @@
+"""The result of a fit: on disk, in memory, and in any configuration."""
+
+from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint, Part
+from splatart_ns.bundle.folder import load_bundle, save_bundle
+from splatart_ns.bundle.posing import (
+    configured_motions,
+    joint_motion,
+    moved_splat,
+    observed_motions,
+    observed_values,
+    part_features,
+    posed_splat,
+)
+
+__all__ = [
+    "JOINT_DOFS",
+    "Bundle",
+    "Joint",
+    "Part",
+    "configured_motions",
+    "joint_motion",
+    "load_bundle",
+    "moved_splat",
+    "observed_motions",
+    "observed_values",
+    "part_features",
+    "posed_splat",
+    "save_bundle",
+]

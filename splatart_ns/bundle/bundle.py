@@ -53,7 +53,8 @@ class Joint:
     residual: float = 0.0
     """Mean distance of the child's points between the observed motion and the joint's, length."""
     covariance: dict[str, Any] = field(default_factory=dict)
-    """Named covariances of the joint's parameters as nested lists; None where undetermined."""
+    """Blocks as nested lists: "axis", "origin" (across the axis), "axis_origin", all [3, 3], and "values" [S, S]; None
+    where undetermined."""
     ambiguous: bool = False
     alternatives: list[dict[str, Any]] = field(default_factory=list)
     """Other types that were tried: {"type", "residual", "score"}."""
@@ -66,8 +67,9 @@ class Bundle:
     parts: list[Part]
     """In order of id."""
     joints: list[Joint]
-    """All accepted joints; those with `in_tree` form a tree whose root is `root`, the rest close loops."""
+    """All accepted joints; those with `in_tree` form a tree, the rest close loops."""
     root: str
+    """The part that the tree hangs from. A part that hangs on nothing has no joint, and moves with the root."""
     states: list[str]
     length_unit: str = "unknown"
     loops: list[dict[str, Any]] = field(default_factory=list)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint, Part
 from splatart_ns.capture.capture import UNLABELLED
-from splatart_ns.errors import InputError
 from splatart_ns.files import write_json
+from splatart_ns.records import Record, read_record
 from splatart_ns.splats.ply import read_ply, write_ply
 from splatart_ns.splats.splat import Splat
 
@@ -88,16 +86,7 @@ def load_bundle(folder: Path) -> Bundle:
     Raises InputError for anything missing, malformed, out of range or inconsistent.
     """
     path = Path(folder) / ARTICULATION
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_constant)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); give a folder that `splatart fit` wrote"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is not JSON ({error}); run `splatart fit` again") from error
-
-    top = _Record(value, path, "the file")
+    top = read_record(path, "give the folder of a bundle")
     if (form := top.text("format")) != FORMAT:
         top.fail("format", f"is '{form}'", f"this version reads '{FORMAT}'")
     states = [s for s in top.items("states") if isinstance(s, str)]
@@ -127,19 +116,13 @@ def load_bundle(folder: Path) -> Bundle:
     return bundle
 
 
-def _read_part(record: _Record, num_states: int, folder: Path) -> Part:
+def _read_part(record: Record, num_states: int, folder: Path) -> Part:
     part_id = record.integer("id")
     if not 1 <= part_id < UNLABELLED:
         record.fail("id", f"is {part_id}", f"part ids are 1 to {UNLABELLED - 1}")
     name = record.text("name")
-    motion = record.tensor("motion", (num_states, 4, 4))
-    R = motion[:, :3, :3]
-    rigid = torch.allclose(R @ R.mT, torch.eye(3, dtype=R.dtype), atol=1e-5) and bool((torch.linalg.det(R) > 0).all())
-    if not rigid or not torch.equal(motion[:, 3], torch.tensor([0.0, 0, 0, 1], dtype=R.dtype).expand(num_states, 4)):
-        record.fail(
-            "motion", "has a matrix that is no rigid motion", "give a rotation, a translation and a row 0 0 0 1"
-        )
-    if not torch.allclose(motion[0], torch.eye(4, dtype=R.dtype), atol=1e-5):
+    motion = record.motions("motion", record.items("motion"), num_states)
+    if not torch.allclose(motion[0], torch.eye(4).to(motion), atol=1e-5):
         record.fail("motion", "does not begin with the identity", "the canonical frame is the world at the first state")
     covariance = torch.full((num_states, 6, 6), math.nan, dtype=torch.float64)
     rows = record.items("motion_covariance")
@@ -155,7 +138,7 @@ def _read_part(record: _Record, num_states: int, folder: Path) -> Part:
     return Part(part_id, name, splat, motion, covariance)
 
 
-def _read_splat(record: _Record, folder: Path) -> Splat:
+def _read_splat(record: Record, folder: Path) -> Splat:
     relative = record.text("splat")
     path = folder / relative
     if "\0" in relative or not path.resolve().is_relative_to(folder.resolve()):
@@ -163,7 +146,7 @@ def _read_splat(record: _Record, folder: Path) -> Splat:
     return read_ply(path)
 
 
-def _read_joint(record: _Record, num_states: int, parts: list[str]) -> Joint:
+def _read_joint(record: Record, num_states: int, parts: list[str]) -> Joint:
     kind = record.choice("type", list(JOINT_DOFS))
     dofs = JOINT_DOFS[kind]
     parent, child = record.choice("parent", parts), record.choice("child", parts)
@@ -200,13 +183,23 @@ def _read_joint(record: _Record, num_states: int, parts: list[str]) -> Joint:
         pitch=record.number("pitch"),
         in_tree=record.flag("in_tree"),
         residual=residual,
-        covariance=record.record("covariance").fields,
+        covariance=_read_covariance(record.record("covariance"), num_states),
         ambiguous=record.flag("ambiguous"),
         alternatives=alternatives,
     )
 
 
-def _read_loop(record: _Record, joints: list[Joint], parts: list[str]) -> dict[str, Any]:
+def _read_covariance(record: Record, num_states: int) -> dict[str, Any]:
+    shapes = {"axis": (3, 3), "origin": (3, 3), "axis_origin": (3, 3), "values": (num_states, num_states)}
+    for name, block in record.fields.items():
+        if name not in shapes:
+            record.fail(name, "is unknown", f"known are {', '.join(shapes)}")
+        if block is not None:
+            record.numbers(name, block, shapes[name])
+    return record.fields
+
+
+def _read_loop(record: Record, joints: list[Joint], parts: list[str]) -> dict[str, Any]:
     joint = record.choice("joint", [joint.name for joint in joints if not joint.in_tree])
     names = record.items("parts")
     if unknown := [name for name in names if name not in parts]:
@@ -214,96 +207,21 @@ def _read_loop(record: _Record, joints: list[Joint], parts: list[str]) -> dict[s
     return {"joint": joint, "parts": names}
 
 
-def _check_unique(record: _Record, key: str, values: list) -> None:
+def _check_unique(record: Record, key: str, values: list) -> None:
     if repeated := {v for v in values if values.count(v) > 1}:
         record.fail(key, f"has {repeated.pop()!r} twice", "names and ids must be unique")
 
 
-def _check_tree(bundle: Bundle, record: _Record) -> None:
-    """Every part but the root is the child of one tree joint, and the root reaches all."""
+def _check_tree(bundle: Bundle, record: Record) -> None:
+    """No part has two parents, the root has none, and every tree joint hangs from the root."""
     children = [joint.child for joint in bundle.joints if joint.in_tree]
     for name in bundle.part_names:
-        expected = 0 if name == bundle.root else 1
-        if children.count(name) != expected:
-            record.fail(
-                "joints",
-                f"give part '{name}' {children.count(name)} parents in the tree",
-                "the root has none and every other part has one",
-            )
-    if len(bundle.tree_joints) != len(children):
-        reached = {bundle.root, *(joint.child for joint in bundle.tree_joints)}
-        lost = next(name for name in bundle.part_names if name not in reached)
-        record.fail("joints", f"form a cycle that holds part '{lost}'", "every part must hang from the root")
-
-
-class _Record:
-    """A JSON object being read: typed access to its fields, with errors that name the place."""
-
-    def __init__(self, value: Any, path: Path, where: str):
-        self.path, self.where = path, where
-        if not isinstance(value, dict):
-            raise InputError(f"{path}: {where} is {_shown(value)} but must be an object; run `splatart fit` again")
-        self.fields: dict[str, Any] = value
-
-    def fail(self, key: str, found: str, mend: str) -> NoReturn:
-        raise InputError(f"{self.path}: '{key}' of {self.where} {found}; {mend}")
-
-    def _get(self, key: str, kind: type | tuple[type, ...], word: str) -> Any:
-        if key not in self.fields:
-            self.fail(key, "is missing", "run `splatart fit` again")
-        value = self.fields[key]
-        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-            self.fail(key, f"is {_shown(value)}", f"give {word}")
-        return value
-
-    def text(self, key: str) -> str:
-        value = self._get(key, str, "a text that is not empty")
-        return value or self.fail(key, "is empty", "give a text that is not empty")
-
-    def integer(self, key: str) -> int:
-        return self._get(key, int, "a whole number")
-
-    def flag(self, key: str) -> bool:
-        return self._get(key, bool, "true or false")
-
-    def items(self, key: str) -> list:
-        return self._get(key, list, "a list")
-
-    def choice(self, key: str, known: list[str]) -> str:
-        value = self._get(key, str, "a text")
-        return value if value in known else self.fail(key, f"is '{value}'", f"known are {', '.join(known) or 'none'}")
-
-    def record(self, key: str) -> _Record:
-        return _Record(self._get(key, dict, "an object"), self.path, f"'{key}' of {self.where}")
-
-    def records(self, key: str) -> list[_Record]:
-        named = [(v.get("name") if isinstance(v, dict) else None, v) for v in self.items(key)]
-        return [_Record(v, self.path, f"{key}[{i}]" + (f" ({n})" if n else "")) for i, (n, v) in enumerate(named)]
-
-    def number(self, key: str) -> float:
-        return float(self.numbers(key, self._get(key, (int, float), "a number"), ()))
-
-    def tensor(self, key: str, shape: tuple[int, ...]) -> Tensor:
-        return self.numbers(key, self._get(key, list, f"numbers of shape {list(shape)}"), shape)
-
-    def numbers(self, key: str, value: Any, shape: tuple[int, ...]) -> Tensor:
-        """Nested lists of exactly this shape, all finite numbers, as float64."""
-
-        def check(v: Any, dims: tuple[int, ...]) -> None:
-            if dims and isinstance(v, list) and len(v) == dims[0]:
-                for item in v:
-                    check(item, dims[1:])
-            elif dims or isinstance(v, bool) or not isinstance(v, int | float) or not abs(v) < 1e300:
-                self.fail(key, f"holds {_shown(v)}", f"give finite numbers of shape {list(shape)}")
-
-        check(value, shape)
-        return torch.tensor(value, dtype=torch.float64)
-
-
-def _shown(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 40 else text[:37] + "..."
-
-
-def _no_constant(name: str) -> None:
-    raise ValueError(f"{name} is no number")
+        most = 0 if name == bundle.root else 1
+        if children.count(name) > most:
+            found = f"give part '{name}' {children.count(name)} parents in the tree"
+            record.fail("joints", found, "the root has none and every other part at most one")
+    hanging = {joint.child for joint in bundle.tree_joints}
+    if lost := [name for name in children if name not in hanging]:
+        record.fail(
+            "joints", f"leave part '{lost[0]}' without a way to the root", "tree joints must hang from the root"
+        )

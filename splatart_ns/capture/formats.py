@@ -91,6 +91,10 @@ def read_capture(path: Path | str, report: Report) -> Capture:
             "expected are subfolders with a transforms.json each, one transforms.json, or PARIS's start/ and end/ with "
             "their camera_train.json",
         )
+    for state in states:
+        if not state.frames:
+            mend = "mend its frames' entries, or list them in train_filenames"
+            report(Problem("error", path / state.name, "the state has no frame that can be used", mend))
     states = [state for state in states if state.frames]
     if not states:
         raise CaptureError(path, "no frame of the capture can be used", "mend the frames' entries")
@@ -115,8 +119,12 @@ def _subfolders(path: Path) -> list[Path]:
     if not path.is_dir():
         return []
     found = [f for f in path.iterdir() if not f.name.startswith(".") and os.path.isfile(f / "transforms.json")]
-    # Digits, and only they, are at the odd places of the split, so numbers meet numbers.
-    return sorted(found, key=lambda f: [int(s) if i % 2 else s for i, s in enumerate(re.split(r"(\d+)", f.name))])
+
+    def key(folder: Path) -> tuple[list[str | int], str]:
+        pieces = re.split(r"(\d+)", folder.name)  # digits, and only they, at the odd places
+        return [int(s) if i % 2 else s for i, s in enumerate(pieces)], folder.name
+
+    return sorted(found, key=key)
 
 
 _Meta = tuple[Path, dict[str, Any]]
@@ -144,8 +152,12 @@ def _read_state(folder: Path, report: Report) -> tuple[State, _Meta]:
 
 def _read_single(file: Path, report: Report) -> tuple[list[State], list[_Meta]]:
     meta = read_json(file)
+    entries = _entries(file, meta)
+    if not any(isinstance(entry, dict) and "state" in entry for entry in entries):
+        mend = 'give every frame "state": 0, 1, ..., or name the folder that holds the state folders'
+        raise CaptureError(file, 'no frame carries "state"', mend)
     groups: dict[int, list[Any]] = {}
-    for i, entry in enumerate(_entries(file, meta)):
+    for i, entry in enumerate(entries):
         k = entry.get("state") if isinstance(entry, dict) else None
         if isinstance(k, bool) or not isinstance(k, int) or not 0 <= k < 10_000:
             found = f"has the state {show(k)}" if k is not None else 'carries no "state"'
@@ -227,24 +239,24 @@ def _read_frames(
         for name, entry in pairs:
             try:
                 if name in splits:
-                    read.append(_frame(file, name, {**meta, **entry}, splits[name]))
+                    read.append(_frame(file, name, meta, entry, splits[name]))
             except CaptureError as error:
                 report(error.problem)
         frames[k] = tuple(read)
     return frames
 
 
-def _frame(file: Path, name: str, values: dict[str, Any], split: str) -> Frame:
+def _frame(file: Path, name: str, meta: dict[str, Any], entry: dict[str, Any], split: str) -> Frame:
     def optional(key: str) -> Path | None:
-        value = values.get(key)
+        value = entry.get(key)
         return None if value is None else file.parent / relative_path(file, f"{key} of frame {name!r}", value)
 
     owner, image = f"frame {name!r}", file.parent / name
     return Frame(
         name=name,
         image=image,
-        camera=parse_camera(file, owner, values, image),
-        T_world_camera=parse_pose(file, owner, values.get("transform_matrix")),
+        camera=parse_camera(file, owner, {**meta, **entry}, image),
+        T_world_camera=parse_pose(file, owner, entry.get("transform_matrix")),
         split=split,
         labels=optional("semantics_path"),
         object_mask=optional("object_mask_path"),
@@ -322,7 +334,7 @@ def safe_names(names: Sequence[str]) -> list[str]:
     out: list[str] = []
     taken: set[str] = set()
     for i, name in enumerate(names):
-        base = re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("._-")[:64] or f"part_{i + 1}"
+        base = re.sub(r"[^A-Za-z0-9_.-]+", "_", name)[:64].lstrip(".-").rstrip(".") or f"part_{i + 1}"
         safe, n = base, 1
         while safe.lower() in taken:
             n += 1
@@ -333,16 +345,19 @@ def safe_names(names: Sequence[str]) -> list[str]:
 
 
 def _largest_label(frames: Sequence[Frame], report: Report) -> int:
-    def largest(path: Path) -> int:
+    def largest(path: Path) -> int | Problem:
         try:
             labels = read_labels(path)
         except CaptureError as error:
-            report(error.problem)
-            return 0
+            return error.problem
         return int(labels[labels != UNLABELLED].max(initial=0))
 
     with ThreadPoolExecutor() as pool:
-        return max(pool.map(largest, [f.labels for f in frames if f.labels is not None]), default=0)
+        found = list(pool.map(largest, [f.labels for f in frames if f.labels is not None]))
+    for problem in found:
+        if isinstance(problem, Problem):
+            report(problem)
+    return max((label for label in found if isinstance(label, int)), default=0)
 
 
 def _raise(problem: Problem) -> None:

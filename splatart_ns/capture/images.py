@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import struct
-from dataclasses import replace
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from splatart_ns.errors import InputError
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
 _PNG_COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGBA"}
+_HALF = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])  # OpenCV's pixel centres lie at integers
 MAX_LABEL = UNLABELLED - 1
 
 
@@ -93,6 +94,19 @@ def read_depth(path: Path, unit: float = 1e-3) -> np.ndarray:
     return np.nan_to_num(depth.astype(np.float32) * np.float32(unit), nan=0.0, posinf=0.0, neginf=0.0)
 
 
+def read_sized(path: Path, reader: Callable[[Path], np.ndarray], camera: Camera) -> np.ndarray:
+    """What `reader` reads, which must have the camera's size."""
+    array = reader(path)
+    height, width = array.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise CaptureError(
+            path,
+            f"it is {width}x{height} pixels, but its camera is {camera.width}x{camera.height}",
+            "resize the file, or correct w, h and the intrinsics",
+        )
+    return array
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image; of a PNG without decoding it."""
     data = _read_bytes(path, 24)
@@ -102,9 +116,22 @@ def image_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
+@lru_cache(maxsize=4096)
 def undistorted_camera(camera: Camera) -> Camera:
-    """The camera without distortion whose image `undistort` gives: nerfstudio's new camera matrix and crop."""
-    return _undistortion(camera)[0] if camera.distorted else camera
+    """The camera without distortion whose image `undistort` gives.
+
+    As in nerfstudio's FullImageDatamanager: OpenCV's optimal new camera matrix without empty pixels (alpha = 0),
+    cropped to its region of interest, found with pixel centres at integers. Raises `InputError` if no pixel is left.
+    """
+    if not camera.distorted:
+        return camera
+    try:
+        new = _optimal_camera(camera)
+        if _sees(camera, new):
+            return new
+    except cv2.error:  # OpenCV's assertions fail where nothing is left
+        pass
+    raise InputError(f"The distortion k1, k2, k3, k4, p1, p2 = {camera.distortion} leaves no image; correct it.")
 
 
 def undistort(image: np.ndarray, camera: Camera) -> np.ndarray:
@@ -114,16 +141,16 @@ def undistort(image: np.ndarray, camera: Camera) -> np.ndarray:
     """
     if not camera.distorted:
         return image
-    _, maps = _undistortion(camera)
-    return _filter(image, lambda x: cv2.remap(x, maps[0], maps[1], cv2.INTER_LINEAR))
+    u, v = _distorted_pixels(camera)
+    return _filter(image, lambda x: cv2.remap(x, u, v, cv2.INTER_LINEAR))
 
 
 def undistort_labels(labels: np.ndarray, camera: Camera) -> np.ndarray:
     """Labels [H, W] as `undistorted_camera(camera)` sees them, by the nearest pixel; 255 where no pixel is."""
     if not camera.distorted:
         return labels
-    _, maps = _undistortion(camera)
-    return cv2.remap(labels, maps[0], maps[1], cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, UNLABELLED)
+    u, v = _distorted_pixels(camera)
+    return cv2.remap(labels, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, UNLABELLED)
 
 
 def downscale(image: np.ndarray, factor: int) -> np.ndarray:
@@ -171,7 +198,7 @@ def _to_bytes(path: Path, pixels: np.ndarray) -> np.ndarray:
     return pixels
 
 
-def _filter(image: np.ndarray, function) -> np.ndarray:
+def _filter(image: np.ndarray, function: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """A linear filter of an image; of RGBA on colours that are multiplied by alpha, given back straight."""
     if image.ndim == 2 or image.shape[2] == 3:
         return function(image)
@@ -181,31 +208,40 @@ def _filter(image: np.ndarray, function) -> np.ndarray:
     return np.rint(np.concatenate([colour, filtered[..., 3:]], axis=2)).clip(0, 255).astype(np.uint8)
 
 
-@lru_cache(maxsize=16)
-def _undistortion(camera: Camera) -> tuple[Camera, tuple[np.ndarray, np.ndarray]]:
-    """The pinhole camera and, for each of its pixels, where it lies in the distorted image.
-
-    As nerfstudio's FullImageDatamanager: OpenCV's optimal new camera matrix with no empty pixels (alpha = 0), cropped
-    to its region of interest, in a frame whose pixel centres are integers.
-    """
-    k1, k2, k3, _, p1, p2 = camera.distortion
-    distortion = np.array([k1, k2, p1, p2, k3])
-    half = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
-    size = (camera.width, camera.height)
-    K, (x, y, w, h) = cv2.getOptimalNewCameraMatrix(camera.K - half, distortion, size, 0)
-    if w <= 0 or h <= 0 or not np.isfinite(K).all():
-        raise InputError(f"The distortion (k1, k2, k3, k4, p1, p2) = {camera.distortion} leaves no image; correct it.")
-    maps = cv2.initUndistortRectifyMap(camera.K - half, distortion, None, K, size, cv2.CV_32FC1)
-    crop = tuple(np.ascontiguousarray(m[y : y + h, x : x + w]) for m in maps)
-    K = K + half
-    camera = replace(
-        camera,
+def _optimal_camera(camera: Camera) -> Camera:
+    K, (x, y, width, height) = cv2.getOptimalNewCameraMatrix(
+        camera.K - _HALF, _opencv_distortion(camera), (camera.width, camera.height), 0
+    )
+    return Camera(
         fx=float(K[0, 0]),
         fy=float(K[1, 1]),
-        cx=float(K[0, 2] - x),
-        cy=float(K[1, 2] - y),
-        width=w,
-        height=h,
-        distortion=(0.0,) * 6,
+        cx=float(K[0, 2] + 0.5 - x),
+        cy=float(K[1, 2] + 0.5 - y),
+        width=width,
+        height=height,
     )
-    return camera, crop
+
+
+@lru_cache(maxsize=16)
+def _distorted_pixels(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Where the pixels of `undistorted_camera(camera)` lie in the distorted image: u, v float32 [H, W]."""
+    new = undistorted_camera(camera)
+    return cv2.initUndistortRectifyMap(
+        camera.K - _HALF, _opencv_distortion(camera), None, new.K - _HALF, (new.width, new.height), cv2.CV_32FC1
+    )
+
+
+def _sees(camera: Camera, new: Camera) -> bool:
+    """Whether the new camera has pixels, and a grid of their rays falls into the distorted image, or nearly."""
+    if min(new.width, new.height) <= 0 or not 0.1 < new.fx / camera.fx < 10 or not 0.1 < new.fy / camera.fy < 10:
+        return False
+    u, v = np.meshgrid(np.linspace(0, new.width, 9), np.linspace(0, new.height, 9))
+    rays = np.stack([(u - new.cx) / new.fx, (v - new.cy) / new.fy, np.ones_like(u)], axis=-1).reshape(-1, 1, 3)
+    pixels, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.K, _opencv_distortion(camera))
+    share = pixels[:, 0] / [camera.width, camera.height]
+    return bool((np.abs(share - 0.5) < 0.55).all())
+
+
+def _opencv_distortion(camera: Camera) -> np.ndarray:
+    k1, k2, k3, _, p1, p2 = camera.distortion
+    return np.array([k1, k2, p1, p2, k3])

@@ -22,26 +22,18 @@ _GREY = (0.7, 0.7, 0.7)
 _SUFFIXES = {".obj", ".dae", ".stl", ".glb", ".gltf", ".ply", ".off"}
 
 
-class _Beside(trimesh.resolvers.Resolver):
+class _Beside(trimesh.resolvers.FilePathResolver):
     """Finds what a mesh file names (materials, textures) relative to that file, outside its folder too.
 
     trimesh 5 refuses paths such as ../images/wood.jpg, and then drops the texture without a word.
     """
 
-    def __init__(self, mesh: Path) -> None:
-        self.mesh = mesh
-        self.file_name = mesh.name
-
     def get(self, name: str) -> bytes:
-        name = name.strip().replace("\\", "/").removeprefix("file://")
-        path = self.mesh.parent / name
+        path = Path(self.parent) / name.strip().replace("\\", "/").removeprefix("file://")
         if not path.is_file():
-            _log.warning("%s names %s, which is not there; its material is left out", self.mesh, name)
+            _log.warning("%s is not there, though a mesh beside it names it; its material is left out", path)
             raise FileNotFoundError(path)
         return path.read_bytes()
-
-    def keys(self) -> list[str]:
-        return [p.name for p in self.mesh.parent.iterdir()]
 
 
 def load_mesh(path: Path, colour: tuple[float, float, float] | None = None) -> Surface:
@@ -62,7 +54,7 @@ def load_mesh(path: Path, colour: tuple[float, float, float] | None = None) -> S
         scene = trimesh.load_scene(
             io.BytesIO(path.read_bytes()),
             file_type=path.suffix[1:].lower(),
-            resolver=_Beside(path),
+            resolver=_Beside(str(path)),
             process=False,
         )
         surfaces = []

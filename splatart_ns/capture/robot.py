@@ -165,9 +165,7 @@ def read_urdf(path: Path) -> Robot:
     if any("xacro" in str(e.tag) for e in robot.iter()):
         raise InputError(f"{path}: holds xacro macros; expand it first with `xacro {path.name} > robot.urdf`.")
 
-    colours = {
-        m.get("name"): m for m in robot.findall("material") if m.find("color") is not None
-    }
+    colours = {m.get("name"): m for m in robot.iter("material") if m.find("color") is not None}
     links: dict[str, tuple[ElementTree.Element, ...]] = {}
     for element in robot.findall("link"):
         name = _attribute(element, "name", path)
@@ -277,9 +275,7 @@ def _visual(visual: ElementTree.Element, path: Path) -> Surface:
     if shape.tag == "box":
         return meshes.box(_numbers(shape, "size", 3, path), colour)
     if shape.tag == "cylinder":
-        return meshes.cylinder(
-            _numbers(shape, "radius", 1, path)[0], _numbers(shape, "length", 1, path)[0], colour
-        )
+        return meshes.cylinder(_numbers(shape, "radius", 1, path)[0], _numbers(shape, "length", 1, path)[0], colour)
     if shape.tag == "sphere":
         return meshes.sphere(_numbers(shape, "radius", 1, path)[0], colour)
     raise InputError(f"{path}: the shape <{shape.tag}> is not known; use mesh, box, cylinder or sphere.")
@@ -317,9 +313,7 @@ def _attribute(element: ElementTree.Element, key: str, path: Path) -> str:
     return value
 
 
-def _numbers(
-    element: ElementTree.Element, key: str, count: int, path: Path, default: str | None = None
-) -> np.ndarray:
+def _numbers(element: ElementTree.Element, key: str, count: int, path: Path, default: str | None = None) -> np.ndarray:
     text = element.get(key, default)
     try:
         numbers = np.array([float(x) for x in text.split()]) if text is not None else np.empty(0)

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from splatart_ns.capture.capture import Camera, CaptureError
-from splatart_ns.capture.images import image_size
+from splatart_ns.capture.images import image_size, undistorted_camera
+from splatart_ns.errors import InputError
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -36,7 +37,7 @@ def read_json(file: Path) -> dict[str, Any]:
 
 def relative_path(file: Path, what: str, value: Any) -> str:
     """A path as JSON gives it, in one spelling: ./a//b is a/b."""
-    if not isinstance(value, str) or not value.strip() or "\0" in value:
+    if not isinstance(value, str) or not value.strip():
         found = "is missing" if value is None else f"is {show(value)}"
         raise CaptureError(file, f"{what} {found}", "give the path of a file, from this file's folder")
     return PurePosixPath(value).as_posix()
@@ -99,22 +100,33 @@ def parse_camera(file: Path, owner: str, values: dict[str, Any], image: Path) ->
     fy = focal("fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
         raise CaptureError(file, f"{owner} has no focal length", "add fl_x and fl_y, in pixels, or camera_angle_x")
+    fx, fy = fx or fy, fy or fx
+    for key, value, size in (("fl_x", fx, width), ("fl_y", fy, height)):
+        if not 0.01 * size < value < 1e4 * size:
+            found = f"{key} of {owner} is {value:g}, for {size} pixels"
+            raise CaptureError(file, found, "give the focal length in pixels, not in millimetres or image widths")
     cx, cy = number("cx"), number("cy")
-    return Camera(
-        fx=fx or fy,
-        fy=fy or fx,
+    camera = Camera(
+        fx=fx,
+        fy=fy,
         cx=width / 2 if cx is None else cx,
         cy=height / 2 if cy is None else cy,
         width=width,
         height=height,
         distortion=_distortion(file, owner, values),
     )
+    try:
+        undistorted_camera(camera)
+    except InputError:
+        found = f"the distortion of {owner}, {camera.distortion}, leaves no image"
+        raise CaptureError(file, found, "correct k1, k2, k3, p1, p2") from None
+    return camera
 
 
 def _distortion(file: Path, owner: str, values: dict[str, Any]) -> tuple[float, ...]:
     given = values.get("distortion_params")
     if given is None:
-        given = [values.get(key) or 0.0 for key in _DISTORTION]
+        given = [0.0 if values.get(key) is None else values[key] for key in _DISTORTION]
     if not isinstance(given, list) or len(given) != len(_DISTORTION):
         found = f"distortion_params of {owner} is {show(given)}"
         raise CaptureError(file, found, "list k1, k2, k3, k4, p1, p2")

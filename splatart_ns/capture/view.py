@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +12,14 @@ import torch
 import trimesh
 from torch import Tensor
 
+from splatart_ns.capture import images
 from splatart_ns.capture.capture import Capture, CaptureError, Frame, Normalization, State
 from splatart_ns.capture.images import (
-    downscale,
     downscale_labels,
     read_image,
     read_labels,
     read_mask,
+    read_sized,
     undistort,
     undistort_labels,
     undistorted_camera,
@@ -69,19 +71,25 @@ def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) ->
 
     Raises `InputError` for a file that cannot be used.
     """
-    pixels = read_pixels(frame)
-    camera = undistorted_camera(frame.camera).downscaled(downscale)
+    distorted = frame.camera
+    camera = undistorted_camera(distorted).downscaled(downscale)
     if min(camera.width, camera.height) < 1:
         raise InputError(f"{frame.image}: nothing is left of the image at 1/{downscale}; use a smaller factor.")
-    image = _shrink(pixels.image, frame, downscale)
-    alpha = None if image.shape[2] == 3 else torch.from_numpy(np.ascontiguousarray(image[..., 3]))
-    if pixels.object_mask is not None:
-        alpha = torch.from_numpy(_shrink(pixels.object_mask, frame, downscale))
-    labels = mask = None
-    if pixels.labels is not None:
-        labels = torch.from_numpy(downscale_labels(undistort_labels(pixels.labels, frame.camera), downscale))
-    if pixels.mask is not None:
-        mask = torch.from_numpy(_shrink(pixels.mask, frame, downscale) > 127)
+
+    def read(path: Path, reader: Callable[[Path], np.ndarray]) -> np.ndarray:
+        return images.downscale(undistort(read_sized(path, reader, distorted), distorted), downscale)
+
+    image = read(frame.image, read_image)
+    alpha = labels = mask = None
+    if frame.object_mask is not None:
+        alpha = torch.from_numpy(read(frame.object_mask, read_mask))
+    elif image.shape[2] == 4:
+        alpha = torch.from_numpy(np.ascontiguousarray(image[..., 3]))
+    if frame.labels is not None:
+        ids = undistort_labels(read_sized(frame.labels, read_labels, distorted), distorted)
+        labels = torch.from_numpy(downscale_labels(ids, downscale))
+    if frame.mask is not None:
+        mask = torch.from_numpy(read(frame.mask, lambda path: np.where(read_mask(path), np.uint8(255), 0)) > 127)
     T = normalization.camera_to_normal(frame.T_world_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
     return View(
         name=frame.name,
@@ -94,29 +102,6 @@ def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) ->
         labels=labels,
         mask=mask,
     )
-
-
-@dataclass
-class Pixels:
-    """A frame's files as they are on disk, all of the camera's size."""
-
-    image: np.ndarray
-    """uint8 [H, W, 3] or [H, W, 4]."""
-    labels: np.ndarray | None = None
-    object_mask: np.ndarray | None = None
-    mask: np.ndarray | None = None
-
-
-def read_pixels(frame: Frame) -> Pixels:
-    """Decode a frame's files. Raises `InputError` for one that is missing, damaged or of another size."""
-    pixels = Pixels(_of_size(frame, frame.image, read_image(frame.image)))
-    if frame.labels is not None:
-        pixels.labels = _of_size(frame, frame.labels, read_labels(frame.labels))
-    if frame.object_mask is not None:
-        pixels.object_mask = _of_size(frame, frame.object_mask, read_mask(frame.object_mask))
-    if frame.mask is not None:
-        pixels.mask = _of_size(frame, frame.mask, np.where(read_mask(frame.mask) != 0, np.uint8(255), np.uint8(0)))
-    return pixels
 
 
 def load_points(path: Path, normalization: Normalization) -> tuple[Tensor, Tensor]:
@@ -135,19 +120,3 @@ def load_points(path: Path, normalization: Normalization) -> tuple[Tensor, Tenso
         raise CaptureError(path, "the point cloud is empty or not finite", "write it again, or take ply_file_path out")
     rgb = rgb[:, :3].astype(np.uint8) if len(rgb) == len(xyz) else np.full(xyz.shape, 128, np.uint8)
     return torch.from_numpy(normalization.scale * (xyz - normalization.centre)).float(), torch.from_numpy(rgb)
-
-
-def _shrink(image: np.ndarray, frame: Frame, factor: int) -> np.ndarray:
-    return downscale(undistort(image, frame.camera), factor)
-
-
-def _of_size(frame: Frame, path: Path, array: np.ndarray) -> np.ndarray:
-    height, width = array.shape[:2]
-    camera = frame.camera
-    if (width, height) != (camera.width, camera.height):
-        raise CaptureError(
-            path,
-            f"it is {width}x{height} pixels, but its camera is {camera.width}x{camera.height}",
-            "resize the file, or correct w, h and the intrinsics",
-        )
-    return array

@@ -43,7 +43,7 @@ def _band(dirs: Tensor, order: int) -> Tensor:
             -a * y * (3 * x * x - y * y),
             b * x * y * z,
             -c * y * (4 * z * z - x * x - y * y),
-            b / math.sqrt(15) * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            b / math.sqrt(60) * z * (2 * z * z - 3 * x * x - 3 * y * y),
             -c * x * (4 * z * z - x * x - y * y),
             b / 2 * z * (x * x - y * y),
             -a * x * (x * x - 3 * y * y),

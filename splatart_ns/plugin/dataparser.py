@@ -82,6 +82,7 @@ class SplatartDataParser(DataParser):
             metadata={
                 "frames": frames,
                 "normalization": normalization,
+                "state": self.config.state,
                 "part_names": ["background", *capture.parts.values()],
             },
             dataparser_transform=torch.from_numpy(

@@ -11,8 +11,10 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from torch import Tensor
 
+from splatart_ns.capture.view import View
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.rasterize.ssim import l1_ssim_loss
+from splatart_ns.stages.hull import carve
 from splatart_ns.stages.semantic import accumulation_loss, part_image, segmentation_loss, vote_logits
 
 
@@ -27,7 +29,7 @@ class SemanticModelConfig(SplatartModelConfig):
     """Weight of the loss between accumulation and the image's silhouette."""
     vote_init: bool = True
     """Whether the logits start from the labels' votes, counted in one backward pass a labelled view."""
-    max_gaussians: int = 20000
+    max_gaussians: int = 12000
     """Gaussians are not split or duplicated beyond this number."""
     background_color: str = "random"
 
@@ -79,9 +81,6 @@ class SemanticModel(SplatartModel):
             }
         outputs = super().get_outputs(camera)
         if self.training:
-            self.strategy.grow_grad2d = (
-                self.config.densify_grad_thresh if self.num_points < self.config.max_gaussians else float("inf")
-            )
             self.strategy.step_pre_backward(
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
             )
@@ -89,7 +88,27 @@ class SemanticModel(SplatartModel):
 
     def step_post_backward(self, step: int) -> None:
         if not self.learns_parts:
+            if step % self.config.refine_every == 0:
+                self._limit_growth()
             super().step_post_backward(step)
+
+    def _limit_growth(self) -> None:
+        """Raise the strategy's threshold so that only the neediest Gaussians that there is room for grow."""
+        room = self.config.max_gaussians - self.num_points
+        self.strategy.grow_grad2d = self.config.densify_grad_thresh
+        if self.strategy_state["count"] is None or room >= self.num_points:
+            return
+        need = self.strategy_state["grad2d"] / self.strategy_state["count"].clamp_min(1)
+        if room <= 0:
+            self.strategy.grow_grad2d = float("inf")
+        else:
+            self.strategy.grow_grad2d = max(self.strategy.grow_grad2d, float(need.topk(room + 1).values[-1]))
+
+    @torch.no_grad()
+    def fade_outside(self, views: list[View]) -> None:
+        """Make Gaussians whose centre lies outside a silhouette, or which no view sees, transparent: they get pruned."""
+        outside = ~carve(views, self.means.cpu(), dilate=2).to(self.device)
+        self.gauss_params["opacities"][outside] = -10.0
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
         """Colour and accumulation losses in the first phase, cross-entropy of the parts in the second."""
@@ -128,6 +147,10 @@ class SemanticPipelineConfig(VanillaPipelineConfig):
 class SemanticPipeline(VanillaPipeline):
     """Lets the second phase see labelled frames only, and starts it from votes."""
 
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self._views: list[View] | None = None
+
     def get_train_loss_dict(self, step: int):
         if self.model.learns_parts:
             if not self._labelled():
@@ -152,11 +175,22 @@ class SemanticPipeline(VanillaPipeline):
 
     def get_training_callbacks(self, training_callback_attributes) -> list[TrainingCallback]:
         callbacks = super().get_training_callbacks(training_callback_attributes)
+        before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+        callbacks.append(TrainingCallback(before, self._keep_inside))
         if self.model.config.vote_init:
-            callbacks.append(
-                TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self._vote_at_semantic_start)
-            )
+            callbacks.append(TrainingCallback(before, self._vote_at_semantic_start))
         return callbacks
+
+    def _keep_inside(self, step: int) -> None:
+        """Before every refinement: no Gaussians outside the silhouettes, where all frames have one."""
+        config = self.model.config
+        if step % config.refine_every != 0 or not 0 < step <= config.semantic_start:
+            return
+        if self._views is None:
+            dataset = self.datamanager.train_dataset
+            self._views = [dataset.get_view(i) for i in range(len(dataset))]
+        if all(view.alpha is not None for view in self._views):
+            self.model.fade_outside(self._views)
 
     def _vote_at_semantic_start(self, step: int) -> None:
         if step != self.model.config.semantic_start:

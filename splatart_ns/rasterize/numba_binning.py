@@ -38,26 +38,29 @@ class Bins(NamedTuple):
     slot_offsets: np.ndarray
     """[S + 1]: where the slots of each sorted Gaussian start."""
     coefficients: np.ndarray
-    """[G, 6]: mean x, y and, of log2(alpha), the factors of dx^2, dx dy, dy^2, 1."""
+    """[G, 6] (x, y, f, s, h, k): log2(alpha) = f (dx + s dy)^2 + h dy^2 + k at (dx, dy) from the mean (x, y)."""
 
 
 @njit(**JIT)
 def _extents(begin, end, worker, means, conics, opacities, visible, width, height, coefficients, ellipses, rows):
-    """Fills the coefficients, ellipses [G, 2] (x half width, squared radius) and rows [G, 2] (first, one past last)."""
+    """Fills the coefficients, ellipses [G, 2] (half width in x, squared radius) and rows [G, 2] (first, one past last).
+
+    All in float64: the rest of a needle's conic is a small difference.
+    """
     for g in range(begin, end):
         rows[g, 0] = 0
         rows[g, 1] = 0
-        opacity = float(opacities[g])
+        opacity = np.float64(opacities[g])
         if not visible[g] or not opacity * 255.0 >= 1.0:
             continue
-        x, y = float(means[g, 0]), float(means[g, 1])
-        a, b, c = float(conics[g, 0]), float(conics[g, 1]), float(conics[g, 2])
+        x, y = np.float64(means[g, 0]), np.float64(means[g, 1])
+        a, b, c = np.float64(conics[g, 0]), np.float64(conics[g, 1]), np.float64(conics[g, 2])
         # A needle's conic can be indefinite by rounding; the bound then makes a long strip of it.
         det = max(a * c - b * b, 1e-12 * a * c)
         radius2 = 2.0 * math.log(255.0 * opacity) + _MARGIN
         half_x, half_y = math.sqrt(radius2 * c / det), math.sqrt(radius2 * a / det)
         # Also false for what is not finite.
-        if not (det > 0.0 and x + half_x > 0.5 and x - half_x < width - 0.5 and abs(y) + half_y < np.inf):
+        if not (0.0 < det < np.inf and x + half_x > 0.5 and x - half_x < width - 0.5 and abs(y) + half_y < np.inf):
             continue
         first = max(math.ceil(max((y - half_y - (TILE - 0.5)) / TILE, -1.0)), 0)
         last = math.floor(min((y + half_y - 0.5) / TILE, float((height - 1) // TILE)))
@@ -67,17 +70,17 @@ def _extents(begin, end, worker, means, conics, opacities, visible, width, heigh
         rows[g, 1] = last + 1
         ellipses[g, 0] = half_x
         ellipses[g, 1] = radius2
-        coefficients[g, 0] = means[g, 0]
-        coefficients[g, 1] = means[g, 1]
+        coefficients[g, 0] = x
+        coefficients[g, 1] = y
         coefficients[g, 2] = -0.5 * _LOG2_E * a
-        coefficients[g, 3] = -_LOG2_E * b
-        coefficients[g, 4] = -0.5 * _LOG2_E * c
+        coefficients[g, 3] = b / a
+        coefficients[g, 4] = -0.5 * _LOG2_E * det / a
         coefficients[g, 5] = math.log2(opacity)
 
 
 @njit(**JIT)
 def _depth_order(depths, rows, gaussians_per_camera):
-    """Gaussians that have rows, by camera and then by depth; a stable radix sort."""
+    """Gaussians that have rows [S], by camera and then by depth, and where their rows start [S + 1]. A stable radix sort."""
     order = np.empty(depths.shape[0], np.int32)
     total = 0
     for start in range(0, depths.shape[0], gaussians_per_camera):
@@ -90,7 +93,7 @@ def _depth_order(depths, rows, gaussians_per_camera):
         items = order[begin:total].copy()
         keys = np.empty(count, np.uint32)
         for i in range(count):
-            bits = depths[items[i]].view(np.uint32)
+            bits = np.float32(depths[items[i]]).view(np.uint32)
             # Order of floats as order of unsigned integers.
             keys[i] = ~bits if bits >> np.uint32(31) else bits | np.uint32(0x80000000)
         sorted_keys, sorted_items = np.empty_like(keys), np.empty_like(items)
@@ -108,38 +111,37 @@ def _depth_order(depths, rows, gaussians_per_camera):
             keys, sorted_keys = sorted_keys, keys
             items, sorted_items = sorted_items, items
         order[begin:total] = items
-    return order[:total]
+    row_offsets = np.zeros(total + 1, np.int64)
+    for k in range(total):
+        row_offsets[k + 1] = row_offsets[k] + rows[order[k], 1] - rows[order[k], 0]
+    return order[:total], row_offsets
 
 
 @njit(**JIT)
-def _spans(
-    begin, end, worker, order, means, conics, ellipses, rows, width, height, tiles_x, tiles_y, per_camera, tallies, sizes
-):
-    """Spans [., 2] of tiles (first, one past last) of each sorted Gaussian's rows.
+def _spans(begin, end, worker, order, row_offsets, means, conics, ellipses, rows, size, grid, spans, tallies, sizes):
+    """Fills the spans [., 2] of tiles (first, one past last) of each sorted Gaussian's rows.
 
     Counts pairs per tile into tallies [workers, tiles] and per sorted Gaussian into sizes [S].
     """
-    total = 0
-    for k in range(begin, end):
-        total += rows[order[k], 1] - rows[order[k], 0]
-    spans = np.empty((total, 2), np.int32)
+    width, height = size
+    tiles_x, tiles_y, per_camera = grid
     tally = tallies[worker]
-    i = 0
+    i = row_offsets[begin]
     for k in range(begin, end):
         g = order[k]
-        x, y = float(means[g, 0]), float(means[g, 1])
-        a, b, c = float(conics[g, 0]), float(conics[g, 1]), float(conics[g, 2])
+        x, y = np.float64(means[g, 0]), np.float64(means[g, 1])
+        a, b, c = np.float64(conics[g, 0]), np.float64(conics[g, 1]), np.float64(conics[g, 2])
         det = max(a * c - b * b, 1e-12 * a * c)
         half_x, radius2 = ellipses[g, 0], ellipses[g, 1]
         half_y = math.sqrt(radius2 * a / det)
         tip = b / c * half_x  # minus the height at which the ellipse reaches furthest right
-        size = 0
+        count = 0
         for row in range(rows[g, 0], rows[g, 1]):
             low = max(row * TILE + 0.5 - y, -half_y)
             high = min(min(row * TILE + TILE - 0.5, height - 0.5) - y, half_y)
             first, past = 0, 0
             if low <= high:
-                # The boundary a dx^2 + 2 b dx dy + c dy^2 = radius2 is convex: its extreme lies at the tip or next to it.
+                # The ellipse a dx^2 + 2 b dx dy + c dy^2 = radius2 is convex: extreme at the tip, or as near as the row lets.
                 right = min(max(-tip, low), high)
                 left = min(max(tip, low), high)
                 x_right = x + (math.sqrt(max(radius2 * a - det * right * right, 0.0)) - b * right) / a
@@ -147,7 +149,7 @@ def _spans(
                 first = max(math.ceil(max((x_left - (TILE - 0.5)) / TILE, -1.0)), 0)
                 past = math.floor(min((x_right - 0.5) / TILE, float(tiles_x - 1))) + 1
                 if x_left <= width - 0.5 and past > first:
-                    size += past - first
+                    count += past - first
                     base = ((g // per_camera) * tiles_y + row) * tiles_x
                     for tile in range(base + first, base + past):
                         tally[tile] += 1
@@ -156,8 +158,7 @@ def _spans(
             spans[i, 0] = first
             spans[i, 1] = past
             i += 1
-        sizes[k] = size
-    return spans
+        sizes[k] = count
 
 
 @njit(**JIT)
@@ -179,11 +180,11 @@ def _offsets(tallies, sizes):
 
 
 @njit(**JIT)
-def _fill(begin, end, worker, spans_of, order, rows, slot_offsets, tiles_x, tiles_y, per_camera, places, gaussians, slots):
+def _fill(begin, end, worker, order, row_offsets, rows, spans, slot_offsets, grid, places, gaussians, slots):
     """Lists the pairs by tile."""
-    spans = spans_of[worker]
+    tiles_x, tiles_y, per_camera = grid
     place = places[worker]
-    i = 0
+    i = row_offsets[begin]
     for k in range(begin, end):
         g = order[k]
         slot = slot_offsets[k]
@@ -207,19 +208,21 @@ def bin_gaussians(means, conics, opacities, depths, visible, cameras: int, width
     per_camera = total // max(cameras, 1)
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     workers = num_workers()
-    coefficients = np.empty((total, 6), np.float32)
+    coefficients = np.empty((total, 6))
     ellipses = np.empty((total, 2))
     rows = np.empty((total, 2), np.int32)
     bounds = even_bounds(total, workers)
     run(_extents, bounds, means, conics, opacities, visible, width, height, coefficients, ellipses, rows)
-    order = _depth_order(depths, rows, max(per_camera, 1))
+    order, row_offsets = _depth_order(depths, rows, max(per_camera, 1))
     bounds = even_bounds(len(order), workers)
+    grid = (tiles_x, tiles_y, max(per_camera, 1))
+    spans = np.empty((row_offsets[-1], 2), np.int32)
     tallies = np.zeros((workers, cameras * tiles_y * tiles_x), np.int64)
     sizes = np.empty(len(order), np.int64)
-    grid = (tiles_x, tiles_y, max(per_camera, 1))
-    spans = run(_spans, bounds, order, means, conics, ellipses, rows, width, height, *grid, tallies, sizes)
+    size = (width, height)
+    run(_spans, bounds, order, row_offsets, means, conics, ellipses, rows, size, grid, spans, tallies, sizes)
     tile_offsets, slot_offsets = _offsets(tallies, sizes)
     gaussians = np.empty(tile_offsets[-1], np.int32)
     slots = np.empty(tile_offsets[-1], np.int32)
-    run(_fill, bounds, tuple(spans), order, rows, slot_offsets, *grid, tallies, gaussians, slots)
+    run(_fill, bounds, order, row_offsets, rows, spans, slot_offsets, grid, tallies, gaussians, slots)
     return Bins(tiles_x, tiles_y, tile_offsets, gaussians, slots, order, slot_offsets, coefficients)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 
 class Projection(NamedTuple):
@@ -49,60 +50,132 @@ def project(
         near_plane, far_plane: Gaussians with depths outside are culled.
         radius_clip: Gaussians with smaller or equal radii are culled, pixels.
     """
-    fx, fy, cx, cy = (Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    R, t = viewmats[:, :3, :3], viewmats[:, :3, 3:]
-    x, y, depths = (R @ means.T + t).unbind(1)
-    in_range = (depths > near_plane) & (depths < far_plane)
-    inverse = 1 / depths.where(in_range, 1.0)
-    u, v = x * inverse, y * inverse
-    means2d = torch.stack([fx * u + cx, fy * v + cy], -1)
-
-    # Outside the image by more than 0.15 of its size the slope of the perspective is kept from growing.
-    margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
-    u = torch.minimum(torch.maximum(u, -cx / fx - margin_x), (width - cx) / fx + margin_x)
-    v = torch.minimum(torch.maximum(v, -cy / fy - margin_y), (height - cy) / fy + margin_y)
-
-    # Rows of J R, the image's derivative by the world, and then in the Gaussian's own axes times its scales.
-    right, down, forward = (R[:, i, :, None] for i in range(3))
-    p = (right - u[:, None] * forward) * (fx * inverse)[:, None]
-    q = (down - v[:, None] * forward) * (fy * inverse)[:, None]
-    axes = _scaled_axes(quats, scales)
-    p = (p[:, :, None] * axes).sum(1)
-    q = (q[:, :, None] * axes).sum(1)
-    pp, pq, qq = p.square().sum(1), (p * q).sum(1), q.square().sum(1)
-
-    # det(cov) = |p x q|^2 has no cancellation, where pp qq - pq^2 loses all digits for needles.
-    sharp = torch.linalg.cross(p, q, dim=1).square().sum(1)
-    det = sharp + eps2d * (pp + qq) + eps2d**2
-    conics = torch.stack([qq + eps2d, -pq, pp + eps2d], -1) / det[..., None]
-    has_area = sharp > 0
-    compensations = (sharp / det).where(has_area, 1.0).sqrt().where(has_area, 0.0)
-
-    with torch.no_grad():
-        half_trace = 0.5 * (pp + qq) + eps2d
-        largest = half_trace + (half_trace.square() - det).clamp_min(0.01).sqrt()
-        radii = (3 * largest.sqrt()).ceil()
-        px, py = means2d.unbind(-1)
-        inside = (px + radii > 0) & (px - radii < width) & (py + radii > 0) & (py - radii < height)
-        radii = radii.where(in_range & inside & (radii > radius_clip), 0).int()
-    return Projection(radii, means2d, depths, conics, compensations)
-
-
-def _scaled_axes(quats: Tensor, scales: Tensor) -> Tensor:
-    """Rotation matrix times scales [3, 3, N] (world axis, own axis, Gaussian)."""
-    w, x, y, z = quats.T
-    norm2 = w * w + x * x + y * y + z * z
-    is_zero = norm2 == 0
-    k = 2 / norm2.where(~is_zero, 1.0)
-    kx, ky, kz = k * x, k * y, k * z
-    xx, yy, zz = kx * x, ky * y, kz * z
-    xy, xz, yz = kx * y, kx * z, ky * z
-    wx, wy, wz = kx * w, ky * w, kz * w
-    sx, sy, sz = scales.T
-    return torch.stack(
-        [
-            torch.stack([sx * (1 - yy - zz), sy * (xy - wz), sz * (xz + wy)]),
-            torch.stack([sx * (xy + wz), sy * (1 - xx - zz), sz * (yz - wx)]),
-            torch.stack([sx * (xz - wy), sy * (yz + wx), sz * (1 - xx - yy)]),
-        ]
+    outputs = _Project.apply(
+        means, quats, scales, viewmats, Ks, (width, height), eps2d, (near_plane, far_plane), radius_clip
     )
+    return Projection(*outputs)
+
+
+class _Project(torch.autograd.Function):
+    """Components come before Gaussians ([3, C, N] and the like), so that every operation runs over long vectors."""
+
+    @staticmethod
+    def forward(ctx, means, quats, scales, viewmats, Ks, size, eps2d, depth_range, radius_clip):
+        size = means.new_tensor(size)[:, None, None]
+        focal = Ks[:, :2, :2].diagonal(dim1=1, dim2=2).T[..., None]  # [2, C, 1], as all of x and y
+        principal = Ks[:, :2, 2].T[..., None]
+        W = viewmats[:, :3, :3].permute(1, 2, 0)[..., None]  # [3, 3, C, 1]
+
+        local = viewmats[:, :3, :3] @ means.T + viewmats[:, :3, 3:]
+        depths = local[:, 2]
+        in_range = (depths > depth_range[0]) & (depths < depth_range[1])
+        inverse = 1 / depths.where(in_range, 1.0)
+        slope = local[:, :2].transpose(0, 1) * inverse
+        means2d = focal * slope + principal
+
+        # Outside the image by more than 0.15 of its size the slope in the derivative is kept from growing.
+        margin = 0.15 * size
+        limited = slope.clamp((-margin - principal) / focal, (size + margin - principal) / focal)
+
+        # The rows p and q of J W, the image's derivative by the world, and those of J W R S.
+        scale = focal * inverse
+        JW = scale[:, None] * (W[:2] - limited[:, None] * W[2])
+        R, unit, inverse_norm = _rotation(quats)
+        axes = R * scales.T  # [3 (world), 3 (own), N]
+        JWRS = (JW[:, :, None] * axes[:, :, None]).sum(1)
+        p, q = JWRS
+        (pp, qq), pq = JWRS.square().sum(1), (p * q).sum(0)
+
+        # det(cov) = |p x q|^2 has no cancellation, where pp qq - pq^2 loses all digits for needles.
+        normal = _cross(p, q)
+        sharp = normal.square().sum(0)
+        inverse_det = 1 / (sharp + eps2d * (pp + qq) + eps2d**2)
+        conics = torch.stack([qq + eps2d, -pq, pp + eps2d]) * inverse_det
+        compensations = (sharp * inverse_det).sqrt()
+
+        half_trace = 0.5 * (pp + qq) + eps2d
+        largest = half_trace + (half_trace.square() - 1 / inverse_det).clamp_min(0.01).sqrt()
+        radii = (3 * largest.sqrt()).ceil()
+        inside = ((means2d + radii > 0) & (means2d - radii < size)).all(0)
+        radii = radii.where(in_range & inside & (radii > radius_clip), 0).int()
+
+        ctx.eps2d = eps2d
+        ctx.save_for_backward(means, scales, viewmats, focal, inverse, in_range, slope, limited, JW, R, unit)
+        ctx.intermediates = inverse_norm, JWRS, normal, sharp, inverse_det, conics, compensations
+        ctx.mark_non_differentiable(radii)
+        means2d, conics = (x.permute(1, 2, 0).contiguous() for x in (means2d, conics))
+        return radii, means2d, depths.contiguous(), conics, compensations.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, _, v_means2d, v_depths, v_conics, v_compensations):
+        means, scales, viewmats, focal, inverse, in_range, slope, limited, JW, R, unit = ctx.saved_tensors
+        inverse_norm, JWRS, normal, sharp, inverse_det, conics, compensations = ctx.intermediates
+        W = viewmats[:, :3, :3].permute(1, 2, 0)[..., None]
+        p, q = JWRS
+
+        # conics = (qq + eps, -pq, pp + eps) / det and compensation^2 = sharp / det.
+        v_a, v_b, v_c = v_conics.unbind(-1)
+        a, b, c = conics
+        v_log_compensation = 0.5 * v_compensations * compensations
+        v_det = -(v_a * a + v_b * b + v_c * c + v_log_compensation) * inverse_det
+        v_sharp = v_det + (v_log_compensation / sharp).where(sharp > 0, 0.0)
+        v_pq = -v_b * inverse_det
+        v_pp, v_qq = v_c * inverse_det + ctx.eps2d * v_det, v_a * inverse_det + ctx.eps2d * v_det
+        turn = 2 * v_sharp * normal
+        v_JWRS = torch.stack([2 * v_pp * p + v_pq * q + _cross(q, turn), 2 * v_qq * q + v_pq * p + _cross(turn, p)])
+
+        axes = R * scales.T
+        v_JW = (v_JWRS[:, None] * axes[:, :, None]).sum(2)
+        scale = focal * inverse
+        v_limited = -scale * (v_JW * W[2]).sum(1)
+        is_free = slope == limited
+        v_slope = focal * v_means2d.permute(2, 0, 1) + v_limited * is_free
+        v_inverse = (v_slope * slope).sum(0) + (v_JW * JW).sum((0, 1))
+        v_depth = v_depths - v_inverse * inverse * in_range
+        v_local = torch.cat([v_slope * inverse, v_depth[None]]).transpose(0, 1)  # [C, 3, N]
+
+        v_means = v_quats = v_scales = v_viewmats = None
+        if ctx.needs_input_grad[0]:
+            v_means = (viewmats[:, :3, :3].mT @ v_local).sum(0).T
+        if ctx.needs_input_grad[1] or ctx.needs_input_grad[2]:
+            v_axes = (JW[:, :, None] * v_JWRS[:, None]).sum((0, 3))
+            v_scales = (v_axes * R).sum(0).T
+            v_quats = _rotation_backward(v_axes * scales.T, unit, inverse_norm)
+        if ctx.needs_input_grad[3]:
+            v_viewmats = torch.zeros_like(viewmats)
+            v_viewmats[:, :3, 3] = v_local.sum(-1)
+            v_viewmats[:, :3, :3] = v_local @ means
+            v_rows = (scale[:, None] * v_JW).sum(-1)  # [2, 3, C]
+            v_forward = -((limited * scale)[:, None] * v_JW).sum((0, -1))
+            v_viewmats[:, :3, :3] += torch.cat([v_rows, v_forward[None]]).permute(2, 0, 1)
+        return v_means, v_quats, v_scales, v_viewmats, None, None, None, None, None
+
+
+def _rotation(quats: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotation matrices [3, 3, N], the unit quaternions [4, N], and one over the norms [N], 0 for zero quaternions."""
+    norm = quats.square().sum(-1).sqrt()
+    inverse_norm = (1 / norm).where(norm > 0, 0.0)
+    unit = quats.T * inverse_norm
+    ww, wx, wy, wz, _, xx, xy, xz, _, _, yy, yz, _, _, _, zz = (2 * unit[:, None] * unit).flatten(0, 1)
+    del ww
+    R = torch.stack(
+        [*(1 - yy - zz, xy - wz, xz + wy), *(xy + wz, 1 - xx - zz, yz - wx), *(xz - wy, yz + wx, 1 - xx - yy)]
+    )
+    return R.unflatten(0, (3, 3)), unit, inverse_norm
+
+
+def _rotation_backward(v_R: Tensor, unit: Tensor, inverse_norm: Tensor) -> Tensor:
+    """Gradient [N, 4] of the quaternions from that of the matrices [3, 3, N]."""
+    w, vector = unit[0], unit[1:]
+    twice = v_R + v_R.transpose(0, 1)
+    skew = torch.stack([v_R[2, 1] - v_R[1, 2], v_R[0, 2] - v_R[2, 0], v_R[1, 0] - v_R[0, 1]])
+    trace = twice.diagonal().sum(-1)
+    v_vector = 2 * ((twice * vector).sum(1) - trace * vector + w * skew)
+    v_unit = torch.cat([2 * (vector * skew).sum(0, keepdim=True), v_vector])
+    return ((v_unit - unit * (unit * v_unit).sum(0)) * inverse_norm).T
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross product along the first dimension."""
+    return torch.linalg.cross(a, b, dim=0)

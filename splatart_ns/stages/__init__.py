@@ -1,0 +1,18 @@
+"""The stages from labelled images to an articulated object: plain functions of plain data."""
+
+from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics, pose_splat
+from splatart_ns.stages.joint import JointFit, fit_joint
+from splatart_ns.stages.tree import build_tree, choose_root, fit_pairs, infer_tree
+
+__all__ = [
+    "Joint",
+    "JointFit",
+    "KinematicTree",
+    "build_tree",
+    "choose_root",
+    "fit_joint",
+    "fit_pairs",
+    "forward_kinematics",
+    "infer_tree",
+    "pose_splat",
+]

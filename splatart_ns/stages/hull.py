@@ -28,19 +28,22 @@ class SeedPoints:
 
 
 def carve(views: Sequence[View], grid: Tensor, dilate: int) -> Tensor:
-    """Which points [N, 3] lie inside every silhouette that sees them (and are seen at all): [N] bool.
+    """Which points [N, 3] lie inside every silhouette, and are seen at all: [N] bool.
 
-    `dilate` widens the silhouettes by so many pixels.
+    A point beyond an image's border counts as outside, unless the silhouette is cut off by the border: then that view
+    says nothing of it. `dilate` widens the silhouettes by so many pixels.
     """
     inside = torch.ones(len(grid), dtype=torch.bool)
     seen = torch.zeros(len(grid), dtype=torch.bool)
     for view in views:
-        silhouette = (view.alpha.float() / 255 > 0.5).float()[None, None]
+        silhouette = (view.alpha > 127).float()[None, None]
+        border = torch.cat([*silhouette[0, 0, [0, -1]], *silhouette[0, 0, :, [0, -1]].T])
+        whole = not bool(border.any())
         if dilate > 0:
             silhouette = F.max_pool2d(silhouette, 2 * dilate + 1, stride=1, padding=dilate)
         u, v, visible = _project(view, grid)
         seen |= visible
-        inside &= ~visible | (silhouette[0, 0, v, u] > 0)
+        inside &= torch.where(visible, silhouette[0, 0, v, u] > 0, not whole)
     return inside & seen
 
 

@@ -22,14 +22,24 @@ import torch
 from torch import Tensor
 
 from splatart_ns.geometry.screw import Screw
-from splatart_ns.geometry.se3 import adjoint, inverse, se3_log, skew, so3_exp, transform_points
+from splatart_ns.geometry.se3 import (
+    adjoint,
+    from_rotation_translation,
+    inverse,
+    se3_log,
+    skew,
+    so3_exp,
+    so3_log,
+    transform_points,
+)
 
 NOISE = 0.003
 """Default registration error of a part's surface, as a share of the object's bounding radius."""
 PRISMATIC_BELOW = 1.2
 """A joint slides if holding the rotation raises the rendering cost by less than this factor."""
 _PENALTY = 6.0  # score of one parameter
-_MAX_ITERATIONS = 50
+_MAX_ITERATIONS = 30
+_LEAST_RADIUS = 0.005  # of the object's radius: no part's turn is known better than by this lever
 _UNDETERMINED_AXIS = math.radians(15)
 _UNDETERMINED_ORIGIN = 0.25  # of the object's radius
 _UNKNOWN_ROTATION = math.radians(5)
@@ -58,7 +68,7 @@ class JointFit:
     converged: bool = True
     iterations: int = 0
     covariance: dict[str, list] = field(default_factory=dict)
-    """Blocks "axis", "origin" (across the axis), "axis_origin", all [3, 3], and "values" [S, S], of those that apply."""
+    """Blocks of what applies: "axis", "origin" (across the axis), "axis_origin", all [3, 3], and "values" [S, S]."""
     ambiguous: bool = False
     """Whether the data support another type nearly as well."""
     alternatives: list[dict] = field(default_factory=list)
@@ -76,12 +86,13 @@ class JointFit:
         axis, origin = self.axis.to(values), self.origin.to(values)
         return joint_motion(self.type, axis, origin, self.pitch, values)
 
-    def reversed(self, points: Tensor) -> JointFit:
-        """The same joint with parent and child exchanged; `points` [N, 3] are those of the new child.
+    def reversed(self, points: Tensor, T_rel: Tensor) -> JointFit:
+        """The same joint with parent and child exchanged, for the new child's points [N, 3] and motions [S, 4, 4].
 
         Every motion becomes its inverse about the same line, so the axis turns round and the values stay.
         """
-        centroid = points.to(self.origin).mean(0)
+        points = points.to(self.origin)
+        centroid = points.mean(0)
         along = float(self.axis @ (centroid - self.origin))
         covariance = dict(self.covariance)
         if "origin" in covariance:
@@ -91,11 +102,12 @@ class JointFit:
             covariance["origin"] = (across @ slid @ across).tolist()
             covariance["axis_origin"] = (-(C_ao + along * C_a) @ across).tolist()
         axis = self.axis if self.type == "fixed" else -self.axis
-        return replace(self, axis=axis, origin=self.origin + along * self.axis, covariance=covariance)
+        flipped = replace(self, axis=axis, origin=self.origin + along * self.axis, covariance=covariance)
+        return replace(flipped, residual=mean_distance(points, T_rel[1:], flipped.motion(self.values[1:])))
 
 
 def joint_motion(kind: str, axis: Tensor, origin: Tensor, pitch: float | Tensor, values: Tensor) -> Tensor:
-    """Motions [..., 4, 4] of a joint of type `kind` at values [...]; axis and origin [3]."""
+    """Motions [..., 4, 4] of joints of type `kind` at values [...]; axes and origins [..., 3] broadcast to them."""
     zero = torch.zeros_like(values)
     turn = zero if kind in ("prismatic", "fixed") else values
     slide = {"prismatic": values, "screw": pitch * values}.get(kind, zero)
@@ -139,38 +151,58 @@ def fit_joint(
     `render_ratio`: rendering cost with the rotation held over the cost of the free fit; where given, it alone chooses
     between turning and sliding. `types` may include "screw", which only three or more states can tell from revolute.
     """
-    T_rel, points = T_rel.double(), points.to(T_rel.device).double()
-    if T_rel.shape[0] < 2:
-        raise ValueError(f"a joint needs the motion of at least two states, not {T_rel.shape[0]}")
-    centroid = points.mean(0)
     if object_radius is None:
-        object_radius = float(torch.linalg.vector_norm(points - centroid, dim=-1).max())
-    # About the child's centroid translation and rotation are nearly independent, and numbers stay small.
-    about = torch.eye(4).to(T_rel)
-    about[:3, 3] = centroid
-    T = (inverse(about) @ T_rel @ about)[1:]
-    floor = surface_noise(points, noise * object_radius, 0.005 * object_radius)
-    noise_covariance = floor.expand(len(T), 6, 6)
-    if covariance is not None:
-        body = adjoint(inverse(T_rel @ about)[1:])
-        noise_covariance = noise_covariance + body @ covariance.to(T_rel)[1:] @ body.mT
-    whiten = torch.linalg.inv(torch.linalg.cholesky(noise_covariance))
+        object_radius = float(torch.linalg.vector_norm(points - points.mean(0), dim=-1).max())
+    covariances = None if covariance is None else covariance[None]
+    return fit_joints(T_rel[None], [points], object_radius, covariances, noise, [render_ratio], types)[0]
 
-    fits = [_fit(kind, T, whiten, points - centroid) for kind in types]
-    fits = [replace(f, origin=f.origin + centroid) for f in fits]
+
+def fit_joints(
+    T_rel: Tensor,
+    points: Sequence[Tensor],
+    object_radius: float,
+    covariances: Tensor | None = None,
+    noise: float = NOISE,
+    render_ratios: Sequence[float | None] | None = None,
+    types: Sequence[str] = ("fixed", "prismatic", "revolute"),
+) -> list[JointFit]:
+    """`fit_joint` for B pairs at once: motions [B, S, 4, 4], covariances [B, S, 6, 6], points and ratios one a pair."""
+    T_rel = T_rel.double()
+    points = [x.to(T_rel) for x in points]
+    if T_rel.shape[1] < 2:
+        raise ValueError(f"a joint needs the motions of at least two states, not {T_rel.shape[1]}")
+    # About the child's centroid translation and rotation are nearly independent, and numbers stay small.
+    centroids = torch.stack([x.mean(0) for x in points])
+    about = from_rotation_translation(torch.eye(3).to(T_rel), centroids)[:, None]
+    T = (inverse(about) @ T_rel @ about)[:, 1:]
+    floor = [surface_noise(x, noise * object_radius, _LEAST_RADIUS * object_radius) for x in points]
+    errors = torch.stack(floor)[:, None].expand(*T.shape[:2], 6, 6)
+    if covariances is not None:
+        to_body = adjoint(inverse(T_rel @ about)[:, 1:])
+        errors = errors + to_body @ covariances.to(T_rel)[:, 1:] @ to_body.mT
+    whiten = torch.linalg.inv(torch.linalg.cholesky(errors))
+    worst_rotation = torch.linalg.eigvalsh(errors[..., 3:, 3:]).amax((-2, -1)).sqrt()
+
+    fits = zip(*(_fit(kind, T, whiten, points) for kind in types), strict=True)
+    ratios = render_ratios or [None] * len(points)
+    return [
+        _choose([replace(f, origin=f.origin + c) for f in pair], ratio, float(sigma), object_radius)
+        for pair, c, ratio, sigma in zip(fits, centroids, ratios, worst_rotation, strict=True)
+    ]
+
+
+def _choose(fits: list[JointFit], render_ratio: float | None, rotation_sigma: float, object_radius: float) -> JointFit:
     best = min(fits, key=lambda f: f.score)
     if render_ratio is not None and best.type != "fixed":
         slides = render_ratio < PRISMATIC_BELOW
         moving = [f for f in fits if f.type != "fixed" and (f.type == "prismatic") == slides]
         best = min(moving, key=lambda f: f.score, default=best)
     others = sorted((f for f in fits if f is not best), key=lambda f: f.score)
-    unknown_rotation = float(torch.linalg.eigvalsh(noise_covariance[:, 3:, 3:]).max()) > _UNKNOWN_ROTATION**2
-    ambiguous = render_ratio is None and (
-        any(f.score < best.score + _PENALTY for f in others) or (best.type == "prismatic" and unknown_rotation)
-    )
+    unseen_turn = best.type == "prismatic" and rotation_sigma > _UNKNOWN_ROTATION
+    close = any(f.score < best.score + _PENALTY for f in others)
     return replace(
         best,
-        ambiguous=ambiguous,
+        ambiguous=render_ratio is None and (close or unseen_turn),
         alternatives=[{"type": f.type, "residual": f.residual, "score": f.score} for f in others],
         undetermined=_undetermined(best, object_radius),
     )
@@ -190,148 +222,170 @@ def _undetermined(fit: JointFit, object_radius: float) -> list[str]:
     return notes
 
 
-def _fit(kind: str, T: Tensor, whiten: Tensor, points: Tensor) -> JointFit:
-    """The best joint of one type for motions T [n, 4, 4] of states 1 and up; the centroid is the origin."""
-    joint = _closed_form(kind, T)
-    r = _residuals(kind, joint, T, whiten)
-    cost, damping, iterations, converged = float(r @ r), 1e-6, 0, kind == "fixed"
-    while not converged and iterations < _MAX_ITERATIONS:
-        iterations += 1
-        J = _jacobian(kind, joint, T, whiten)
-        # Columns of unit length: lengths, radians and barely determined directions stand on one footing.
-        scale = torch.linalg.vector_norm(J, dim=0).clamp_min(1e-150)
-        H, g = (J / scale).mT @ (J / scale), (J / scale).mT @ r
-        while True:
-            step = torch.linalg.solve(H + damping * torch.eye(len(g)).to(H), -g)
-            trial = _moved(kind, joint, step / scale)
-            r_trial = _residuals(kind, trial, T, whiten)
-            trial_cost = float(r_trial @ r_trial)
-            if trial_cost <= cost:
-                break
-            damping *= 10
-            if damping > 1e8:
-                break
-        if trial_cost > cost:
-            converged = True  # no direction goes down: rounding
+# B joints under fit: axes [B, 3], their points nearest the centroid [B, 3], pitches [B], values [B, n].
+_Joints = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def _fit(kind: str, T: Tensor, whiten: Tensor, points: list[Tensor]) -> list[JointFit]:
+    """The best joints of one type for motions T [B, n, 4, 4] of states 1 and up; the centroid is the origin."""
+    joints = _closed_form(kind, T)
+    r = _residuals(kind, joints, T, whiten)
+    cost, damping = (r * r).sum(-1), torch.full_like(T[:, 0, 0, 0], 1e-6)
+    iterations = torch.zeros_like(cost, dtype=torch.long)
+    converged = torch.full_like(iterations, kind == "fixed", dtype=torch.bool)
+    for _ in range(_MAX_ITERATIONS):
+        if converged.all():
             break
-        converged = cost - trial_cost <= 1e-10 * cost + 1e-16
-        joint, r, cost, damping = trial, r_trial, trial_cost, max(damping / 10, 1e-12)
-    return _result(kind, joint, T, whiten, points, cost, iterations, converged)
+        iterations += ~converged
+        H, g, scale = _normal_equations(_jacobian(kind, joints, T, whiten), r)
+        step = torch.linalg.solve(H + damping[:, None, None] * torch.eye(H.shape[-1]).to(H), -g) / scale
+        trial = _moved(kind, joints, step)
+        r_trial = _residuals(kind, trial, T, whiten)
+        trial_cost = (r_trial * r_trial).sum(-1)
+        better = (trial_cost <= cost) & ~converged
+        # Where no step goes down any more only rounding is left.
+        converged = converged | better & (cost - trial_cost <= 1e-8 * cost + 1e-16) | ~better & (damping > 1e6)
+        joints = tuple(
+            torch.where(better.view(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(joints, trial, strict=True)
+        )
+        r, cost = torch.where(better[:, None], r_trial, r), torch.where(better, trial_cost, cost)
+        damping = torch.where(better, (damping / 10).clamp_min(1e-12), damping * 10)
+    return _results(kind, joints, T, whiten, points, cost, iterations, converged)
 
 
-# A joint under fit: axis [3], the foot point of the centroid on it [3], pitch [], values [n].
-_Joint = tuple[Tensor, Tensor, Tensor, Tensor]
+def _normal_equations(J: Tensor, r: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """J^T J and J^T r for columns of unit length, and their lengths: so that metres and radians weigh the same."""
+    scale = torch.linalg.vector_norm(J, dim=-2).clamp_min(1e-150)
+    J = J / scale[:, None]
+    return J.mT @ J, (J.mT @ r[..., None])[..., 0], scale
 
 
-def _closed_form(kind: str, T: Tensor) -> _Joint:
+def _closed_form(kind: str, T: Tensor) -> _Joints:
     """The common axis of all states: the principal direction of their turns (or slides), and its least-squares line."""
-    R, t = T[:, :3, :3], T[:, :3, 3]
-    zero = torch.zeros(3).to(t)
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    zero = torch.zeros_like(t[:, 0])
     if kind == "fixed":
-        return torch.tensor([0.0, 0.0, 1.0]).to(t), zero, zero[0], torch.zeros(len(T)).to(t)
-    along = t if kind == "prismatic" else se3_log(T)[:, 3:]
-    axis = torch.linalg.svd(along, full_matrices=True).Vh[0]
-    values = along @ axis
+        return torch.tensor([0.0, 0.0, 1.0]).to(t).expand_as(zero), zero, zero[:, 0], torch.zeros_like(t[..., 0])
+    along = t if kind == "prismatic" else so3_log(R)
+    axis = torch.linalg.svd(along).Vh[:, 0]
+    values = (along @ axis[..., None])[..., 0]
     if kind == "prismatic":
-        return axis, zero, zero[0], values
-    slides = t @ axis
-    pitch = slides @ values / (values @ values).clamp_min(1e-300) if kind == "screw" else zero[0]
+        return axis, zero, zero[:, 0], values
+    slides = (t @ axis[..., None])[..., 0]
+    pitch = (slides * values).sum(-1) / (values * values).sum(-1).clamp_min(1e-300) if kind == "screw" else zero[:, 0]
     # A point o of the axis only slides: (1 - R) o = t - slide. Solved across the axis, in two unknowns.
     across = _across(axis)
-    A = ((torch.eye(3).to(R) - R) @ across).reshape(-1, 2)
-    b = (t - slides[:, None] * axis).reshape(-1)
-    H = A.mT @ A
-    offset = torch.linalg.solve(H + 1e-28 * torch.eye(2).to(H), A.mT @ b)
-    return axis, across @ offset, pitch, values
+    A = ((torch.eye(3).to(R) - R) @ across[:, None]).flatten(1, 2)
+    b = (t - slides[..., None] * axis[:, None]).flatten(1, 2)
+    # The tiny constant matters to motions without a turn only: their axis is then drawn through the centroid.
+    offset = torch.linalg.solve(A.mT @ A + 1e-28 * torch.eye(2).to(A), A.mT @ b[..., None])
+    return axis, (across @ offset)[..., 0], pitch, values
 
 
 def _across(axis: Tensor) -> Tensor:
-    """Two orthonormal directions across an axis, as columns [3, 2]."""
-    return torch.linalg.svd(axis[None], full_matrices=True).Vh[1:].mT
+    """Two orthonormal directions across each axis, as columns [B, 3, 2]."""
+    return torch.linalg.svd(axis[:, None]).Vh[:, 1:].mT
 
 
-def _residuals(kind: str, joint: _Joint, T: Tensor, whiten: Tensor) -> Tensor:
-    """What the model leaves, T = model exp(x), in standard deviations [6 n]."""
-    x = se3_log(inverse(joint_motion(kind, *joint)) @ T)
-    return (whiten @ x[..., None]).reshape(-1)
+def _model(kind: str, joints: _Joints) -> Tensor:
+    axis, point, pitch, values = joints
+    return joint_motion(kind, axis[:, None], point[:, None], pitch[:, None], values)
 
 
-def _jacobian(kind: str, joint: _Joint, T: Tensor, whiten: Tensor) -> Tensor:
-    """Derivatives of the residuals [6 n, K]: two turns of the axis, two shifts (if it turns), pitch (screw), values."""
-    axis, point, pitch, values = joint
-    n, turns = len(T), kind != "prismatic"
+def _residuals(kind: str, joints: _Joints, T: Tensor, whiten: Tensor) -> Tensor:
+    """What the model leaves, T = model exp(x), in standard deviations [B, 6 n]."""
+    x = se3_log(inverse(_model(kind, joints)) @ T)
+    return (whiten @ x[..., None]).flatten(1)
+
+
+def _jacobian(kind: str, joints: _Joints, T: Tensor, whiten: Tensor) -> Tensor:
+    """Derivatives [B, 6 n, K] of the residuals: axis turns (2), axis shifts (2, if it turns), pitch (screw), values."""
+    axis, point, pitch, values = joints
+    n, turns = values.shape[1], kind != "prismatic"
     across = _across(axis)
-    model = joint_motion(kind, *joint)
-    body = adjoint(inverse(model)) - torch.eye(6).to(T)
-    # Turning the axis about its foot point, and shifting it: the model changes by a conjugation.
-    columns = [body @ torch.cat([torch.linalg.cross(point, b), b]) for b in across.unbind(1)]
-    if turns:
-        columns += [body @ torch.cat([b, torch.zeros_like(b)]) for b in across.unbind(1)]
+    turning = torch.cat([torch.linalg.cross(point[..., None].expand_as(across), across, dim=-2), across], -2)
+    shifting = torch.cat([across, torch.zeros_like(across)], -2)
+    model = _model(kind, joints)
+    # Turning the axis about its point, or shifting it, conjugates the model: seen from the body, Ad(model^-1) - 1.
+    conjugated = (adjoint(inverse(model)) - torch.eye(6).to(T)) @ (
+        torch.cat([turning, shifting], -1) if turns else turning
+    )[:, None]
+    twist = torch.cat([torch.linalg.cross(point, axis) + pitch[:, None] * axis, axis], -1)
+    if not turns:
+        twist = torch.cat([axis, torch.zeros_like(axis)], -1)
+    columns = [conjugated, torch.eye(n).to(T)[:, None] * twist[:, None, :, None]]
     if kind == "screw":
-        columns.append(torch.cat([values[:, None] * axis, torch.zeros(n, 3).to(T)], -1))
-    twist = torch.cat([torch.linalg.cross(point, axis) + pitch * axis, axis]) if turns else torch.cat([axis, 0 * axis])
-    changes = torch.cat([torch.stack(columns, -1), torch.diag_embed(torch.ones(n).to(T))[:, None] * twist[:, None]], -1)
-    # The change comes in on the model's side of x; the inverse left Jacobian of SE(3) carries it to x.
+        slide = values[..., None] * axis[:, None]
+        columns.insert(1, torch.cat([slide, torch.zeros_like(slide)], -1)[..., None])
+    # The changes come in on the model's side of x; the inverse left Jacobian of SE(3) carries them to x.
     x = se3_log(inverse(model) @ T)
-    zero = torch.zeros(n, 3, 3).to(T)
-    ad = torch.cat([torch.cat([skew(x[:, 3:]), skew(x[:, :3])], -1), torch.cat([zero, skew(x[:, 3:])], -1)], -2)
+    turned = skew(x[..., 3:])
+    ad = torch.cat([torch.cat([turned, skew(x[..., :3])], -1), torch.cat([torch.zeros_like(turned), turned], -1)], -2)
     carry = torch.eye(6).to(T) - ad / 2 + ad @ ad / 12
-    return -(whiten @ carry @ changes).reshape(6 * n, -1)
+    return -(whiten @ carry @ torch.cat(columns, -1)).flatten(1, 2)
 
 
-def _moved(kind: str, joint: _Joint, step: Tensor) -> _Joint:
-    axis, point, pitch, values = joint
+def _moved(kind: str, joints: _Joints, step: Tensor) -> _Joints:
+    axis, point, pitch, values = joints
     across = _across(axis)
-    turned = so3_exp(across @ step[:2]) @ axis
+    turned = (so3_exp((across @ step[:, :2, None])[..., 0]) @ axis[..., None])[..., 0]
+    turned = turned / torch.linalg.vector_norm(turned, dim=-1, keepdim=True)
     if kind != "prismatic":
-        point = point + across @ step[2:4]
-        point = point - (point @ turned) * turned
+        point = point + (across @ step[:, 2:4, None])[..., 0]
+        point = point - (point * turned).sum(-1, keepdim=True) * turned
     if kind == "screw":
-        pitch = pitch + step[4]
-    return turned / torch.linalg.vector_norm(turned), point, pitch, values + step[-len(values) :]
+        pitch = pitch + step[:, 4]
+    return turned, point, pitch, values + step[:, -values.shape[1] :]
 
 
-def _result(
-    kind: str, joint: _Joint, T: Tensor, whiten: Tensor, points: Tensor, cost: float, iterations: int, converged: bool
-) -> JointFit:
-    axis, point, pitch, values = joint
-    covariance, parameters = {}, 0
-    if kind != "fixed":
-        J = _jacobian(kind, joint, T, whiten)
-        parameters = J.shape[1]
-        freedom = J.shape[0] - parameters
-        covariance = _covariance(kind, joint, J, max(1.0, cost / freedom) if freedom > 0 else 1.0)
-        if values[values.abs().argmax()] < 0:
-            axis, values = -axis, -values
-            if "axis_origin" in covariance:
-                covariance["axis_origin"] = (-torch.tensor(covariance["axis_origin"])).tolist()
-    return JointFit(
-        type=kind,
-        axis=axis,
-        origin=point,
-        pitch=float(pitch),
-        values=torch.cat([torch.zeros(1).to(values), values]),
-        residual=mean_distance(points, T, joint_motion(kind, *joint)),
-        score=cost + _PENALTY * parameters,
-        chi2=cost,
-        converged=converged,
-        iterations=iterations,
-        covariance=covariance,
-    )
+def _results(
+    kind: str,
+    joints: _Joints,
+    T: Tensor,
+    whiten: Tensor,
+    points: list[Tensor],
+    cost: Tensor,
+    iterations: Tensor,
+    converged: Tensor,
+) -> list[JointFit]:
+    axis, point, pitch, values = joints
+    model = _model(kind, joints)
+    J = torch.zeros_like(whiten.flatten(1, 2)[..., :0]) if kind == "fixed" else _jacobian(kind, joints, T, whiten)
+    parameters, freedom = J.shape[2], J.shape[1] - J.shape[2]
+    inflation = (cost / freedom).clamp_min(1) if freedom > 0 else torch.ones_like(cost)
+    covariances = [{}] * len(points) if kind == "fixed" else _covariances(kind, axis, J, inflation, values.shape[1])
+    farthest = values.gather(1, values.abs().argmax(1, keepdim=True))
+    sign = torch.where(farthest < 0, -1.0, 1.0).to(values)
+    values = torch.cat([torch.zeros_like(sign), values * sign], 1)
+    axis = axis if kind == "fixed" else axis * sign
+    return [
+        JointFit(
+            type=kind,
+            axis=axis[i],
+            origin=point[i],
+            pitch=float(pitch[i]),
+            values=values[i],
+            residual=mean_distance(points[i] - points[i].mean(0), T[i], model[i]),
+            score=float(cost[i]) + _PENALTY * parameters,
+            chi2=float(cost[i]),
+            converged=bool(converged[i]),
+            iterations=int(iterations[i]),
+            covariance=covariances[i],
+        )
+        for i in range(len(points))
+    ]
 
 
-def _covariance(kind: str, joint: _Joint, J: Tensor, inflation: float) -> dict[str, list]:
+def _covariances(kind: str, axis: Tensor, J: Tensor, inflation: Tensor, n: int) -> list[dict[str, list]]:
     """Blocks of the inverse Hessian. A direction that the data do not see comes out large, not zero."""
-    axis, _, _, values = joint
-    scale = torch.linalg.vector_norm(J, dim=0).clamp_min(1e-150)
-    H = (J / scale).mT @ (J / scale)
-    C = inflation * torch.linalg.inv(H + 1e-14 * torch.eye(len(H)).to(H)) / torch.outer(scale, scale)
+    H, _, scale = _normal_equations(J, J[..., 0])
+    C = torch.linalg.inv(H + 1e-14 * torch.eye(H.shape[-1]).to(H)) / (scale[:, :, None] * scale[:, None])
+    C = inflation[:, None, None] * C
     across = _across(axis)
     to_axis = -skew(axis) @ across  # a turn w of the axis moves it by w x axis
-    n = len(values)
-    blocks = {"axis": to_axis @ C[:2, :2] @ to_axis.mT, "values": torch.zeros(n + 1, n + 1).to(C)}
-    blocks["values"][1:, 1:] = C[-n:, -n:]
+    blocks = {"axis": to_axis @ C[:, :2, :2] @ to_axis.mT}
     if kind != "prismatic":
-        blocks["origin"] = across @ C[2:4, 2:4] @ across.mT
-        blocks["axis_origin"] = to_axis @ C[:2, 2:4] @ across.mT
-    return {name: block.tolist() for name, block in blocks.items()}
+        blocks["origin"] = across @ C[:, 2:4, 2:4] @ across.mT
+        blocks["axis_origin"] = to_axis @ C[:, :2, 2:4] @ across.mT
+    blocks["values"] = torch.nn.functional.pad(C[:, -n:, -n:], (1, 0, 1, 0))
+    return [{name: block[i].tolist() for name, block in blocks.items()} for i in range(len(J))]

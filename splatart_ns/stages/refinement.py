@@ -29,7 +29,7 @@ class Refinement:
 
 
 def increment(T: Tensor, xi: Tensor, centroid: Tensor, radius: float) -> Tensor:
-    """Motions [..., 4, 4] after a small motion xi [..., 6]: translation in radii, then rotation about the moved centroid."""
+    """Motions [..., 4, 4] after small ones xi [..., 6]: translation in radii, rotation about the moved centroid."""
     pivot = transform_points(T, centroid[None])[..., 0, :]
     R = so3_exp(xi[..., 3:])
     small = from_rotation_translation(R, pivot + radius * xi[..., :3] - (R @ pivot[..., None])[..., 0])
@@ -113,8 +113,8 @@ def _covariance(pair: PartPair, T: Tensor, equations: _NormalEquations) -> Tenso
 def rotation_held_ratio(pair: PartPair, T: Tensor, R: Tensor) -> float:
     """How much worse a part fits when it may only slide: cost with the rotation held at R [3, 3] over cost free.
 
-    `T` [4, 4] is the free solution; the held one starts with the part's centroid where T puts it. Near 1 for a part that
-    slides, above 5 for one that turns (POSES.md, section 3); 1.2 separates them.
+    `T` [4, 4] is the free solution; the held one starts with the part's centroid where T puts it. Measured ratios are
+    near 1 for parts that slide and above 5 for parts that turn; 1.2 separates them.
     """
     free = refine(pair, T)
     moved = transform_points(free.T, pair.centroid[None])[0]

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.visibility import SEEN
 
 MIN_POINTS = 8
 """A part with fewer Gaussians than this in a state cannot be registered."""
@@ -20,7 +23,6 @@ TRIM = 0.15
 """Share of the worst correspondences that each step leaves out: what only one of the states shows."""
 COLOUR = 0.3
 """Colour difference (0 to 1) of one counts as this many part radii."""
-MIN_OPACITY = 0.1
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class PartPoints:
     rgb: np.ndarray
     """Colours of the constant band [N, 3], about 0 to 1."""
     weight: np.ndarray
-    """Opacity times the probability of the part [N]: low for hidden and for mixed Gaussians."""
+    """Visibility times the probability of the part [N]: low for hidden and for mixed Gaussians."""
 
     @property
     def centroid(self) -> np.ndarray:
@@ -54,12 +56,13 @@ class Registration:
     this ranks candidates but must not choose among them (see render_choice)."""
 
 
-def part_points(splat: Splat, part: int) -> PartPoints:
-    """The Gaussians whose most likely part is `part`, without the nearly transparent ones."""
-    part_splat = splat.select((splat.part_ids == part) & (splat.opacities > MIN_OPACITY)).detach().to("cpu")
+def part_points(splat: Splat, seen: Tensor, part: int) -> PartPoints:
+    """The visible Gaussians whose most likely part is `part`; `seen` [N] is the splat's `visibility`."""
+    chosen = (splat.part_ids == part) & (seen > SEEN)
+    part_splat = splat.select(chosen).detach().to("cpu")
     # 0.28209 is the constant spherical harmonic.
     rgb = 0.5 + 0.28209479177387814 * part_splat.sh[:, 0].double().numpy()
-    weight = part_splat.opacities * part_splat.part_probabilities[:, part]
+    weight = seen[chosen].cpu() * part_splat.part_probabilities[:, part]
     return PartPoints(part_splat.means.double().numpy(), rgb, weight.double().numpy())
 
 
@@ -83,6 +86,33 @@ def register(source: PartPoints, target: PartPoints, seed: int = 0, keep: int = 
     fit = (forth + back) / 2
     chosen = distinct(T, fit, source.centroid, source.radius)[:keep]
     return Registration(T[chosen], fit[chosen])
+
+
+def point_to_plane(source: PartPoints, target: PartPoints, T: np.ndarray) -> np.ndarray:
+    """Motions [C, 4, 4] that refine T [C, 4, 4] by OpenCV's point-to-plane ICP on the shapes alone.
+
+    Points may slide along surfaces, so it gets much closer on smooth parts than nearest points do (Chen and Medioni
+    1991), but nothing holds it where only the colours do: offer its results beside T, not instead.
+    """
+    icp = cv2.ppf_match_3d_ICP(ITERATIONS, 0.005, 2.5, 4)
+    scene = np.concatenate([target.xyz, _normals(target)], axis=1).astype(np.float32)
+    normals = _normals(source)
+    refined = []
+    for start in T:
+        R = start[:3, :3]
+        model = np.concatenate([source.xyz @ R.T + start[:3, 3], normals @ R.T], axis=1)
+        _, _, pose = icp.registerModelToScene(model.astype(np.float32), scene)
+        rigid = np.isfinite(pose).all() and np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3)
+        refined.append(pose @ start if rigid else start)
+    return np.stack(refined)
+
+
+def _normals(points: PartPoints) -> np.ndarray:
+    """Unit normals [N, 3] of the planes through each point's neighbours, of either sign."""
+    k = min(10, len(points.xyz))
+    neighbours = points.xyz[cKDTree(points.xyz).query(points.xyz, k=k)[1]]
+    centred = neighbours - neighbours.mean(axis=1, keepdims=True)
+    return np.linalg.eigh(centred.swapaxes(1, 2) @ centred)[1][..., 0]
 
 
 def distinct(T: np.ndarray, cost: np.ndarray, centroid: np.ndarray, radius: float) -> list[int]:
@@ -133,9 +163,7 @@ def _moved_features(T: np.ndarray, sample: PartPoints, colour: float) -> np.ndar
     return np.concatenate([xyz, np.broadcast_to(colour * sample.rgb, xyz.shape)], axis=2)
 
 
-def _icp_step(
-    T: np.ndarray, sample: PartPoints, colour: float, target: PartPoints, target_tree: cKDTree
-) -> np.ndarray:
+def _icp_step(T: np.ndarray, sample: PartPoints, colour: float, target: PartPoints, target_tree: cKDTree) -> np.ndarray:
     """One step of every motion: nearest points, trimming, the rigid fit (Kabsch 1976)."""
     distance, nearest = target_tree.query(_moved_features(T, sample, colour))
     inlier = distance <= np.quantile(distance, 1 - TRIM, axis=1, keepdims=True)

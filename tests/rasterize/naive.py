@@ -3,8 +3,8 @@
 import torch
 
 
-def project(means, quats, scales, viewmats, Ks, eps2d=0.3, margins=None):
-    """Means, covariances before the blur, and depths by matrices; `margins` are the limits of x/z and y/z."""
+def project(means, quats, scales, viewmats, Ks, margins):
+    """Means, covariances before the blur, and depths by matrices; `margins` limit x/z and y/z in the slope."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     R = torch.stack(
         [
@@ -24,8 +24,7 @@ def project(means, quats, scales, viewmats, Ks, eps2d=0.3, margins=None):
     u, v = local[..., 0] / safe, local[..., 1] / safe
     fx, fy, cx, cy = (Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     means2d = torch.stack([fx * u + cx, fy * v + cy], -1)
-    if margins is not None:
-        u, v = (a.clamp(low, high) for a, (low, high) in zip((u, v), margins, strict=True))
+    u, v = (a.clamp(low, high) for a, (low, high) in zip((u, v), margins, strict=True))
     zero = torch.zeros_like(u)
     J = torch.stack([fx / safe, zero, -fx * u / safe, zero, fy / safe, -fy * v / safe], -1).unflatten(-1, (2, 3))
     JW = J @ W
@@ -35,7 +34,7 @@ def project(means, quats, scales, viewmats, Ks, eps2d=0.3, margins=None):
 
 def composite(means2d, conics, opacities, colors, depths, visible, width, height):
     """Front to back over black, one camera after another, one Gaussian after another, all pixels at once."""
-    ys, xs = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    ys, xs = torch.meshgrid(*(torch.arange(n).to(means2d) + 0.5 for n in (height, width)), indexing="ij")
     images, alphas = [], []
     for c in range(len(means2d)):
         T = torch.ones(height, width, dtype=means2d.dtype)

@@ -1,0 +1,56 @@
+"""The method `splatart-pose`: stage 2, part poses over all states."""
+
+import torch
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from splatart_ns.plugin import compat  # noqa: F401  (lets torch read nerfstudio's checkpoints)
+from splatart_ns.plugin.datamanager import SplatartDatamanagerConfig
+from splatart_ns.plugin.dataparser import SplatartDataParserConfig
+from splatart_ns.plugin.pose import PoseModelConfig, PosePipelineConfig
+
+POSE_STEPS = 200
+MERGE_STEPS = 400
+
+
+def _adam(lr: float) -> dict:
+    return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": None}
+
+
+method = MethodSpecification(
+    config=TrainerConfig(
+        method_name="splatart-pose",
+        steps_per_save=2000,
+        steps_per_eval_batch=0,
+        steps_per_eval_image=0,
+        steps_per_eval_all_images=0,
+        max_num_iterations=POSE_STEPS + MERGE_STEPS,
+        mixed_precision=False,
+        pipeline=PosePipelineConfig(
+            datamanager=SplatartDatamanagerConfig(dataparser=SplatartDataParserConfig()),
+            model=PoseModelConfig(pose_steps=POSE_STEPS),
+        ),
+        optimizers={
+            "part_poses": {
+                "optimizer": AdamOptimizerConfig(lr=3e-3, eps=1e-15),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=1e-4, max_steps=POSE_STEPS),
+            },
+            # Of the merged Gaussians: they are nearly right.
+            "means": _adam(2e-4),
+            "scales": _adam(3e-3),
+            "quats": _adam(3e-3),
+            "opacities": _adam(1e-2),
+            "features_dc": _adam(5e-3),
+            "features_rest": _adam(5e-4),
+            "semantics": _adam(1e-2),
+            "camera_opt": _adam(1e-4),
+        },
+        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+        vis="viewer",
+    ),
+    description="SPLATART stage 2: the pose of every part at every state, and part splats from all states",
+)

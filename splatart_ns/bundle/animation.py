@@ -1,0 +1,140 @@
+"""Pictures of a bundle in motion: rendering configurations, writing frames, GIFs and videos."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import imageio_ffmpeg
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from splatart_ns.bundle.bundle import Bundle
+from splatart_ns.bundle.posing import normalized, part_features, posed_splat
+from splatart_ns.bundle.viewpoint import Viewpoint, bounding_sphere
+from splatart_ns.capture.capture import Normalization
+from splatart_ns.errors import InputError
+from splatart_ns.files import replacing
+from splatart_ns.geometry.camera import viewmat_from_opengl
+from splatart_ns.rasterize.render import Rendering, render
+
+Output = Literal["rgb", "depth", "accumulation", "parts"]
+
+
+@torch.no_grad()
+def render_frames(
+    bundle: Bundle,
+    configurations: Sequence[Mapping[str, float]],
+    viewpoint: Viewpoint,
+    output: Output = "rgb",
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> Iterator[np.ndarray]:
+    """Render one frame per configuration, uint8 [H, W, 3] RGB.
+
+    `background` is in 0..1. Depth is shown in colours, red near and blue far, over the depths that the object can have;
+    parts have the colours of `part_colours`; accumulation is grey.
+    """
+    centre, radius = bounding_sphere(bundle, configurations)
+    # The renderer's near plane is a fixed length, so the object is brought to the size of one unit.
+    normalization = Normalization(centre, 1 / radius)
+    T = torch.from_numpy(normalization.camera_to_normal(viewpoint.T_world_camera))
+    viewmat = viewmat_from_opengl(T).float()[None]
+    camera = viewpoint.camera
+    features = part_features(bundle) @ part_colours(bundle)
+    distance = float(T[:3, 3].norm())
+    for configuration in configurations:
+        rendering = render(
+            normalized(posed_splat(bundle, configuration), normalization),
+            viewmat,
+            torch.from_numpy(camera.K).float()[None],
+            camera.width,
+            camera.height,
+            features=features if output == "parts" else None,
+            with_depth=output == "depth",
+        )
+        image = _image(rendering, output, torch.tensor(background), (distance - 1, distance + 1))
+        yield (255 * image.clamp(0, 1)).round().byte().numpy()
+
+
+def _image(rendering: Rendering, output: Output, background: Tensor, depths: tuple[float, float]) -> Tensor:
+    """What is shown [H, W, 3] in 0..1."""
+    accumulation = rendering.accumulation[0]
+    if output == "accumulation":
+        return accumulation.expand(-1, -1, 3)
+    if output == "depth":
+        near, far = depths
+        share = ((far - rendering.depth[0, ..., 0]) / (far - near)).clamp(0, 1)
+        colours = cv2.applyColorMap((255 * share).round().byte().numpy(), cv2.COLORMAP_TURBO)[..., ::-1]
+        image = accumulation * torch.from_numpy(colours.copy()) / 255
+    else:
+        image = rendering.rgb[0] if output == "rgb" else rendering.features[0]
+    return image + (1 - accumulation) * background
+
+
+def part_colours(bundle: Bundle) -> Tensor:
+    """A colour per part [P, 3] in 0..1 that depends on its id alone; neighbouring ids differ most."""
+    golden = 0.6180339887498949
+    return torch.tensor([colorsys.hsv_to_rgb((part.id * golden) % 1, 0.65, 0.9) for part in bundle.parts])
+
+
+def write_frames(frames: Iterable[np.ndarray], path: Path, fps: float = 30.0) -> int:
+    """Write frames [H, W, 3] RGB to `*.gif`, `*.mp4`, or, for a path without suffix, as PNGs into a folder.
+
+    Files appear under their names when they are whole. PNGs are `frame_0000.png` and so on; those of an earlier,
+    longer run are removed. Returns the number of frames.
+    """
+    path = Path(path)
+    match path.suffix.lower():
+        case ".gif":
+            return _write_gif(frames, path, fps)
+        case ".mp4":
+            return _write_mp4(frames, path, fps)
+        case "":
+            return _write_pngs(frames, path)
+        case suffix:
+            raise InputError(f"{path}: '{suffix}' cannot be written; give a .gif, an .mp4 or a folder")
+
+
+def _write_pngs(frames: Iterable[np.ndarray], folder: Path) -> int:
+    count = 0
+    for frame in frames:
+        with replacing(folder / f"frame_{count:04d}.png") as temporary:
+            Image.fromarray(frame).save(temporary)
+        count += 1
+    for stale in folder.glob("frame_*.png"):
+        number = stale.stem.removeprefix("frame_")
+        if number.isdecimal() and int(number) >= count:
+            stale.unlink()
+    return count
+
+
+def _write_gif(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
+    images = [Image.fromarray(frame).quantize() for frame in frames]
+    with replacing(path) as temporary:
+        images[0].save(temporary, save_all=True, append_images=images[1:], duration=1000 / fps, loop=0)
+    return len(images)
+
+
+def _write_mp4(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
+    count, writer = 0, None
+    with replacing(path) as temporary:
+        try:
+            for frame in frames:
+                # Video has one colour sample for 2 x 2 pixels.
+                height, width = frame.shape[:2]
+                frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+                if writer is None:
+                    size = frame.shape[1], frame.shape[0]
+                    writer = imageio_ffmpeg.write_frames(str(temporary), size, fps=fps, quality=8, macro_block_size=2)
+                    writer.send(None)
+                writer.send(np.ascontiguousarray(frame))
+                count += 1
+        finally:
+            if writer is not None:
+                writer.close()
+    return count

@@ -1,0 +1,97 @@
+"""Joint values for rendering: what a person types, sweeps over the observed range, trajectories from CSV files."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
+from splatart_ns.errors import InputError
+
+Configuration = dict[str, float]
+"""Joint name to value, radian or length; joints that are not named are at 0, where state 0 has them."""
+
+
+def movable_joints(bundle: Bundle) -> dict[str, Joint]:
+    """The tree's joints that one number sets, by name, parents before children."""
+    return {joint.name: joint for joint in bundle.tree_joints if JOINT_DOFS[joint.type] == 1}
+
+
+def parse_settings(settings: Sequence[str], bundle: Bundle) -> Configuration:
+    """A configuration from texts `joint=value`; see `parse_value`. Values beyond the observed limits are taken."""
+    configuration: Configuration = {}
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        if not equals:
+            raise InputError(f"--set: '{setting}' has no '='; write joint=value, for example door=30deg")
+        name = name.strip()
+        if name in configuration:
+            raise InputError(f"--set: joint '{name}' is set twice; set it once")
+        configuration[name] = parse_value(text, _find(name, bundle, "--set"), "--set")
+    return configuration
+
+
+def parse_value(text: str, joint: Joint, where: str) -> float:
+    """A joint's value: a plain number in the bundle's unit (radian or length), or with the suffix `deg` an angle."""
+    number = text.strip()
+    degrees = number.lower().endswith("deg")
+    if degrees and joint.type == "prismatic":
+        raise InputError(f"{where}: '{text.strip()}' is an angle but joint '{joint.name}' slides; give a length")
+    try:
+        value = float(number[:-3] if degrees else number)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"{where}: '{text.strip()}' for joint '{joint.name}' is no number; write 0.5 or 30deg")
+    return math.radians(value) if degrees else value
+
+
+def sweep(bundle: Bundle, base: Mapping[str, float], frames_per_joint: int) -> list[Configuration]:
+    """One movable joint after the other over its observed range, there and back, the others as in `base`.
+
+    Each joint moves like a cosine, begins and ends at its value in `base` (0 where it has none).
+    """
+    configurations = []
+    for name, joint in movable_joints(bundle).items():
+        low, high = joint.limits
+        if low == high:
+            continue
+        start = min(max(base.get(name, 0.0), low), high)
+        phase = math.acos(1 - 2 * (start - low) / (high - low))
+        for frame in range(frames_per_joint):
+            angle = phase + 2 * math.pi * frame / frames_per_joint
+            configurations.append({**base, name: low + (high - low) * (1 - math.cos(angle)) / 2})
+    return configurations or [dict(base)]
+
+
+def read_trajectory(path: Path, bundle: Bundle) -> list[Configuration]:
+    """Configurations from a CSV file: a header of joint names, then a row of values (see `parse_value`) per frame."""
+    try:
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
+            rows = [(i, row) for i, row in enumerate(csv.reader(file), start=1) if any(cell.strip() for cell in row)]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: is no CSV text ({error}); save it as UTF-8") from error
+    if len(rows) < 2:
+        raise InputError(f"{path}: has {len(rows)} lines; give a header of joint names and a row of values per frame")
+    names = [cell.strip() for cell in rows[0][1]]
+    joints = [_find(name, bundle, f"{path}") for name in names]
+    if len(set(names)) < len(names):
+        raise InputError(f"{path}: the header names a joint twice; name each once")
+    configurations = []
+    for line, row in rows[1:]:
+        if len(row) != len(names):
+            raise InputError(f"{path}: line {line} has {len(row)} values; the header names {len(names)} joints")
+        values = [parse_value(cell, joint, f"{path}, line {line}") for cell, joint in zip(row, joints, strict=True)]
+        configurations.append(dict(zip(names, values, strict=True)))
+    return configurations
+
+
+def _find(name: str, bundle: Bundle, where: str) -> Joint:
+    joints = movable_joints(bundle)
+    if name not in joints:
+        raise InputError(f"{where}: no movable joint is called '{name}'; there are {', '.join(joints) or 'none'}")
+    return joints[name]

@@ -1,0 +1,187 @@
+"""What is wrong with a capture, and how to mend it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame, Normalization, Problem, State
+from splatart_ns.capture.formats import read_capture
+from splatart_ns.capture.images import read_depth, read_image, read_labels, read_mask, read_sized
+from splatart_ns.capture.view import load_points
+from splatart_ns.errors import InputError
+
+
+def check_capture(path: Path | str) -> list[Problem]:
+    """All that is wrong with a capture: its structure first, then its files frame by frame, then its views and labels.
+
+    Every file is decoded once. Never raises for what is in the capture.
+    """
+    return _check(Path(path))[1]
+
+
+def require_valid(path: Path | str) -> Capture:
+    """Load and check a capture. Raises `InputError` with the first error, and how many there are."""
+    capture, problems = _check(Path(path))
+    errors = [p for p in problems if p.severity == "error"]
+    if errors or capture is None:
+        more = f" (and {len(errors) - 1} more, see `splatart check {path}`)" if len(errors) > 1 else ""
+        raise InputError(f"{errors[0]}{more}.")
+    return capture
+
+
+def _check(path: Path) -> tuple[Capture | None, list[Problem]]:
+    problems: list[Problem] = []
+    try:
+        capture = read_capture(path, problems.append)
+    except CaptureError as error:
+        return None, [*problems, error.problem]
+    frames = [frame for state in capture.states for frame in state.frames]
+    with ThreadPoolExecutor() as pool:
+        contents = list(pool.map(lambda frame: _look(frame, capture.parts), frames))
+    for content in contents:
+        problems.extend(content.problems)
+    by_frame = dict(zip(map(id, frames), contents, strict=True))
+    problems.extend(_check_states(capture))
+    problems.extend(_check_duplicates(capture))
+    for state in capture.states:
+        problems.extend(_check_cameras(capture, state))
+        problems.extend(_check_silhouettes(capture, state, [by_frame[id(f)] for f in state.frames]))
+        problems.extend(_check_points(state))
+    pixels = [sum((by_frame[id(f)].pixels for f in s.split("train")), np.zeros(256, int)) for s in capture.states]
+    problems.extend(_check_labels(capture, np.array(pixels)))
+    return capture, list(dict.fromkeys(problems))
+
+
+@dataclass
+class _Content:
+    """What a frame's files hold."""
+
+    problems: list[Problem] = field(default_factory=list)
+    pixels: np.ndarray = field(default_factory=lambda: np.zeros(256, int))
+    """Number of pixels of each label [256]."""
+    silhouette: float | None = None
+    """The part of the image inside the silhouette, if the frame has one."""
+
+
+def _look(frame: Frame, parts: dict[int, str]) -> _Content:
+    content = _Content()
+
+    def read(path: Path | None, reader: Callable[[Path], np.ndarray]) -> np.ndarray | None:
+        try:
+            return None if path is None else read_sized(path, reader, frame.camera)
+        except CaptureError as error:
+            content.problems.append(error.problem)
+            return None
+
+    image = read(frame.image, read_image)
+    silhouette = read(frame.object_mask, read_mask)
+    if frame.object_mask is None and image is not None and image.shape[2] == 4:
+        silhouette = image[..., 3]
+    if silhouette is not None:
+        content.silhouette = float((silhouette > 127).mean())
+    mask = read(frame.mask, read_mask)
+    if mask is not None and not mask.any():
+        message, mend = "the mask leaves no pixel to the loss", "white must be what counts; or take the frame out"
+        content.problems.append(Problem("warning", frame.mask, message, mend))
+    read(frame.depth, read_depth)
+    labels = read(frame.labels, read_labels)
+    if labels is not None:
+        content.pixels = np.bincount(labels.ravel(), minlength=256)
+        unknown = [i for i in np.flatnonzero(content.pixels[:UNLABELLED]) if i > 0 and i not in parts]
+        if unknown:
+            message = f"the label {unknown[-1]} is none of the declared parts 1 to {max(parts, default=0)}"
+            mend = "add its name to semantic_classes, or correct the labels"
+            content.problems.append(Problem("error", frame.labels, message, mend))
+    return content
+
+
+def _check_states(capture: Capture) -> Iterator[Problem]:
+    if len(capture.states) < 2:
+        found = f"there is only the state {capture.states[0].name}"
+        yield Problem("error", capture.path, found, "add the object at a second configuration: one shows no motion")
+    if not any(state.split("test") or state.split("val") for state in capture.states):
+        yield Problem(
+            "warning", capture.path, "no view is held out for tests", "list some in test_filenames to measure quality"
+        )
+
+
+def _check_duplicates(capture: Capture) -> Iterator[Problem]:
+    seen: dict[str, str] = {}
+    for state in capture.states:
+        for frame in state.frames:
+            path = os.path.normpath(frame.image)
+            if path in seen:
+                found = f"the image belongs to two frames, in {seen[path]} and in {state.name}"
+                yield Problem("error", frame.image, found, "keep one of them")
+            seen[path] = state.name
+
+
+def _check_cameras(capture: Capture, state: State) -> Iterator[Problem]:
+    place, frames = capture.path / state.name, state.split("train")
+    if not frames:
+        yield Problem("error", place, "the state has no training view", "list some frames in train_filenames")
+        return
+    centres = np.stack([f.T_world_camera[:3, 3] for f in frames])
+    if np.ptp(centres, axis=0).max() * capture.normalization.scale < 1e-3:
+        found = "there is one training view" if len(frames) == 1 else "all training cameras stand on one spot"
+        yield Problem(
+            "error", place, found, "give views from around the object, with poses relative to the object's fixed world"
+        )
+
+
+def _check_silhouettes(capture: Capture, state: State, contents: list[_Content]) -> Iterator[Problem]:
+    shares = [content.silhouette for content in contents]
+    known = [share for share in shares if share is not None]
+    if known and max(known) == 0:
+        found = "all silhouettes are empty"
+        yield Problem("error", capture.path / state.name, found, "make the object white in object_mask_path, or opaque")
+        return
+    for frame, share in zip(state.frames, shares, strict=True):
+        if share == 0:
+            found, file = "the silhouette is empty", frame.object_mask or frame.image
+            yield Problem("warning", file, found, "leave the frame out if the object cannot be seen")
+    if known and min(known) == 1:
+        found = "all silhouettes fill their images, so the background counts as the object"
+        mend = "give silhouettes by object_mask_path, or images without alpha"
+        yield Problem("warning", capture.path / state.name, found, mend)
+
+
+def _check_points(state: State) -> Iterator[Problem]:
+    if state.points is not None:
+        try:
+            load_points(state.points, Normalization(np.zeros(3), 1.0))
+        except CaptureError as error:
+            yield error.problem
+
+
+def _check_labels(capture: Capture, pixels: np.ndarray) -> Iterator[Problem]:
+    """Problems with the labels of the training frames; `pixels` [states, 256] counts each label's."""
+    seen = {i: np.flatnonzero(pixels[:, i]) for i in capture.parts}
+    labelled = (pixels[:, 1:UNLABELLED] > 0).any(axis=1)
+    if not labelled.any():
+        mend = "give some frames of each state a semantics_path: a PNG of part ids"
+        yield Problem("error", capture.path, "no training frame has part labels", mend)
+        return
+    for state, is_labelled in zip(capture.states, labelled, strict=True):
+        if not is_labelled:
+            found = "no training frame of this state has part labels"
+            yield Problem("error", capture.path / state.name, found, "label a few of its frames")
+    names = [state.name for state, is_labelled in zip(capture.states, labelled, strict=True) if is_labelled]
+    if len(capture.parts) == 1:
+        yield Problem("warning", capture.path, "there is only one part", "label at least two parts to find a joint")
+    for i, name in capture.parts.items():
+        part = f"part {i} ({name})"
+        if len(seen[i]) == 0:
+            mend = "label it in some training frames of every state, or take it out of semantic_classes"
+            yield Problem("error", capture.path, f"{part} is never labelled", mend)
+        elif len(seen[i]) < len(names):
+            missing = next(n for k, n in enumerate(names) if k not in seen[i])
+            found = f"{part} is not labelled in {missing}, so its motion cannot be known there"
+            severity = "error" if len(seen[i]) == 1 else "warning"
+            yield Problem(severity, capture.path, found, "label it in some training frames of that state")

@@ -1,0 +1,430 @@
+"""A capture with ground truth, rendered from a URDF."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import trimesh
+
+from splatart_ns.capture.capture import Camera
+from splatart_ns.capture.ray_caster import Light, RayCaster
+from splatart_ns.capture.robot import Joint, Part, Robot, read_urdf
+from splatart_ns.capture.surface import Surface
+from splatart_ns.errors import InputError
+
+POINTS_PER_PART = 10_000
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+_MARGIN = 1.05
+"""Room about the object's bounding sphere in the image."""
+_TURN = 1.75
+"""Radian: joints that turn further than this are moved within a window of it, so that states have views in common."""
+
+
+@dataclass(frozen=True)
+class SynthesisOptions:
+    """How a capture is rendered."""
+
+    states: int = 2
+    """How many configurations, when no joint values are given."""
+    joint_values: tuple[str, ...] = ()
+    """One "joint=value,joint=value" per state (radian, length); without it, values are drawn within the limits."""
+    freeze: tuple[str, ...] = ()
+    """"joint=value" for joints that are held there in all states; their links become one part."""
+    train_views: int = 40
+    """Training views per state."""
+    test_views: int = 8
+    """Test views per state, and of the novel configuration."""
+    views: Literal["sphere", "hemisphere"] = "sphere"
+    """See the object from everywhere, or from above only."""
+    resolution: int = 256
+    """Pixels along each side of an image."""
+    fov_degrees: float = 35.0
+    """Field of view across an image."""
+    labelled_fraction: float = 1.0
+    """Share of the training views of a state that come with part labels, 0 to 1; test views always do."""
+    samples: int = 2
+    """Rays per pixel along each side, against jagged edges."""
+    light: Light = field(default_factory=Light)
+    """What lights the object."""
+    length_unit: str = "metre"
+    """The URDF's unit of length, as it is noted in the ground truth."""
+    seed: int = 0
+    """The same seed writes the same bytes."""
+
+
+def synthesize(urdf: Path, output_dir: Path, options: SynthesisOptions | None = None) -> Path:
+    """Render a capture of a robot, with labels and ground truth.
+
+    Every joint that can move does, between the states. The novel configuration in `eval/novel_00` lies half way
+    between the first two states. The world is the frame of the URDF's root link, z up.
+
+    Args:
+        urdf: the robot's description.
+        output_dir: a folder that does not exist yet, or is empty.
+        options: the default ones if None.
+
+    Returns:
+        `output_dir`.
+
+    Raises:
+        InputError: a URDF or mesh that cannot be read, options that make no sense, an output folder in use.
+    """
+    options = options or SynthesisOptions()
+    output_dir = Path(output_dir)
+    _check(options)
+    robot = read_urdf(Path(urdf))
+    frozen = _frozen(robot, options)
+    configurations = _configurations(robot, frozen, options)
+    scene = _Scene.of(robot, frozen, configurations)
+    with _new_folder(output_dir) as folder:
+        for k, values in enumerate(configurations):
+            _write_state(folder / f"state_{k:02d}", scene, values, options, options.train_views, k)
+        _write_state(folder / "eval" / "novel_00", scene, scene.novel, options, 0, len(configurations))
+        _write_points(folder / "ground_truth_points", scene, options.seed)
+        text = json.dumps(_ground_truth(scene, options), indent=1)
+        (folder / "ground_truth.json").write_text(text + "\n", encoding="utf-8")
+    return output_dir
+
+
+def _check(options: SynthesisOptions) -> None:
+    def refuse(name: str, rule: str) -> None:
+        raise InputError(f"The option {name.replace('_', '-')} is {getattr(options, name)}; give {rule}.")
+
+    for name, least in (("states", 2), ("train_views", 1), ("test_views", 0), ("resolution", 8), ("samples", 1)):
+        if getattr(options, name) < least:
+            refuse(name, f"{least} or more")
+    if not 1.0 <= options.fov_degrees <= 120.0:
+        refuse("fov_degrees", "1 to 120")
+    if not 0.0 <= options.labelled_fraction <= 1.0:
+        refuse("labelled_fraction", "0 to 1")
+    if options.views not in ("sphere", "hemisphere"):
+        refuse("views", "sphere or hemisphere")
+    if options.seed < 0:
+        refuse("seed", "0 or more")
+    if len(options.joint_values) == 1:
+        refuse("joint_values", "the values of two states or more")
+    if not np.linalg.norm(options.light.direction) > 0.0 or not 0.0 <= options.light.ambient <= 1.0:
+        refuse("light", "a direction that is not zero and an ambient share of 0 to 1")
+
+
+def _assignments(text: str, robot: Robot) -> dict[str, float]:
+    """{"a": 1.0, "b": 2.0} of "a=1,b=2"."""
+    values = {}
+    for item in filter(None, (x.strip() for x in text.split(","))):
+        name, _, number = (x.strip() for x in item.partition("="))
+        joint = robot.joint(name)
+        try:
+            value = float(number)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError(f"The joint value {item!r} is not of the form joint=number; write for example {name}=0.5.")
+        if joint.mimic is not None:
+            raise InputError(f"{robot.path}: joint {name!r} mimics {joint.mimic.joint!r}; give a value to that one.")
+        if joint.limits is not None and not joint.limits[0] - 1e-9 <= value <= joint.limits[1] + 1e-9:
+            low, high = joint.limits
+            raise InputError(
+                f"{robot.path}: joint {name!r} cannot be at {value:g}; its limits are {low:g} to {high:g}."
+            )
+        values[name] = value
+    return values
+
+
+def _frozen(robot: Robot, options: SynthesisOptions) -> dict[str, float]:
+    """Values of the joints held by the user, and of those that mimic them."""
+    frozen: dict[str, float] = {}
+    for text in options.freeze:
+        frozen.update(_assignments(text, robot))
+    values = robot.complete(frozen)
+    for _ in robot.movable:
+        frozen.update({j.name: values[j.name] for j in robot.movable if j.mimic and j.mimic.joint in frozen})
+    return frozen
+
+
+def _configurations(robot: Robot, frozen: Mapping[str, float], options: SynthesisOptions) -> list[dict[str, float]]:
+    """The values of all movable joints, for each state."""
+    if options.joint_values:
+        return [robot.complete({**_assignments(text, robot), **frozen}) for text in options.joint_values]
+    free = [j for j in robot.movable if j.name not in frozen and j.mimic is None]
+    rng = np.random.default_rng([options.seed, 0])
+    columns = {j.name: _spread_values(j, robot, options.states, rng) for j in free}
+    return [
+        robot.complete({**{name: float(v[k]) for name, v in columns.items()}, **frozen}) for k in range(options.states)
+    ]
+
+
+def _spread_values(joint: Joint, robot: Robot, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Values within the limits, one in the middle of each of `count` equal ranges, shuffled: each state moves it."""
+    turns = joint.type != "prismatic"
+    if joint.limits is None and not turns:
+        raise InputError(f"{robot.path}: joint {joint.name!r} has no limits; add a <limit>, or give joint values.")
+    low, high = joint.limits or (-math.pi, math.pi)
+    if turns and high - low > _TURN:
+        middle = rng.uniform(low + 0.5 * _TURN, high - 0.5 * _TURN)
+        low, high = middle - 0.5 * _TURN, middle + 0.5 * _TURN
+    places = (rng.permutation(count) + rng.uniform(0.3, 0.7, count)) / count
+    return np.round(low + (high - low) * places, 4).clip(low, high)
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What is rendered, and where it is in each state."""
+
+    robot: Robot
+    frozen: dict[str, float]
+    parts: tuple[Part, ...]
+    ids: dict[str, int]
+    """Part name to id, of the parts that have a shape."""
+    surfaces: dict[int, Surface]
+    """Part id to the part's surface in its own frame."""
+    configurations: list[dict[str, float]]
+    novel: dict[str, float]
+    centre: np.ndarray
+    """[3]: of the box about all states."""
+    radius: float
+    """Of the sphere about the centre that holds all states."""
+
+    @staticmethod
+    def of(robot: Robot, frozen: dict[str, float], configurations: list[dict[str, float]]) -> _Scene:
+        parts = robot.parts(frozen)
+        shaped = [p for p in parts if p.has_geometry]
+        if not shaped:
+            raise InputError(f"{robot.path}: no link has a <visual>; there is nothing to render.")
+        if len(shaped) > 254:
+            raise InputError(f"{robot.path}: has {len(shaped)} parts; labels have room for 254, freeze some joints.")
+        ids = {p.name: i for i, p in enumerate(shaped, start=1)}
+        surfaces = {ids[p.name]: robot.surface(p, configurations[0]) for p in shaped}
+        first, second = configurations[:2]
+        novel = robot.complete({name: 0.5 * (first[name] + second[name]) for name in first})
+
+        points = []
+        for values in (*configurations, novel):
+            poses = robot.link_poses(values)
+            for part in shaped:
+                T, corners = poses[part.frame_link], surfaces[ids[part.name]].triangles.reshape(-1, 3)
+                points.append(corners @ T[:3, :3].T + T[:3, 3])
+        points = np.concatenate(points)
+        centre = np.round(0.5 * (points.min(axis=0) + points.max(axis=0)), 9)
+        radius = float(np.linalg.norm(points - centre, axis=-1).max())
+        return _Scene(robot, frozen, parts, ids, surfaces, configurations, novel, centre, radius)
+
+    def part_poses(self, values: Mapping[str, float]) -> dict[str, np.ndarray]:
+        """T_world_part [4, 4] by part name."""
+        poses = self.robot.link_poses(values)
+        return {p.name: poses[p.frame_link] for p in self.parts}
+
+    def placed(self, values: Mapping[str, float]) -> dict[int, Surface]:
+        """Part id to surface in the world."""
+        poses = self.part_poses(values)
+        return {i: self.surfaces[i].moved(poses[name]) for name, i in self.ids.items()}
+
+    def camera_distance(self, fov_degrees: float) -> float:
+        """From the centre to a camera that sees all of the bounding sphere."""
+        return _MARGIN * self.radius / math.sin(math.radians(0.5 * fov_degrees))
+
+
+def camera_poses(count: int, centre: np.ndarray, distance: float, views: str, rng: np.random.Generator) -> np.ndarray:
+    """Cameras [count, 4, 4] (OpenGL camera-to-world) that look at the centre, z up: a jittered Fibonacci lattice."""
+    place = (np.arange(count) + rng.uniform(0.25, 0.75, count)) / max(count, 1)
+    z = 1.0 - (place if views == "hemisphere" else 2.0 * place)
+    spacing = math.sqrt(4.0 * math.pi / max(count, 1))
+    azimuth = np.arange(count) * _GOLDEN_ANGLE + rng.uniform(0.0, 2.0 * math.pi)
+    azimuth += rng.uniform(-0.15, 0.15, count) * spacing
+    across = np.sqrt(1.0 - z**2)
+    back = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=-1)
+    right = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(count)], axis=-1)
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3, 0], T[:, :3, 1], T[:, :3, 2] = right, np.cross(back, right), back
+    T[:, :3, 3] = centre + distance * back
+    return np.round(T, 9)
+
+
+def _write_state(
+    folder: Path, scene: _Scene, values: Mapping[str, float], options: SynthesisOptions, train_views: int, index: int
+) -> None:
+    """Images, labels, silhouettes and transforms.json of one configuration."""
+    size = options.resolution
+    focal = 0.5 * size / math.tan(math.radians(0.5 * options.fov_degrees))
+    camera = Camera(focal, focal, 0.5 * size, 0.5 * size, size, size)
+    rng = np.random.default_rng([options.seed, 1, index])
+    distance = scene.camera_distance(options.fov_degrees)
+    poses = np.concatenate(
+        [camera_poses(n, scene.centre, distance, options.views, rng) for n in (train_views, options.test_views)]
+    )
+    labelled = set(rng.permutation(train_views)[: round(options.labelled_fraction * train_views)].tolist())
+    for name in ("images", "semantics", "masks"):
+        (folder / name).mkdir(parents=True)
+
+    caster, frames = RayCaster(scene.placed(values)), []
+    for i, T in enumerate(poses):
+        seen = caster.render(camera, T, options.light, options.samples)
+        name = f"{i:04d}.png"
+        frame = {"file_path": f"images/{name}"}
+        _write_png(folder / "images" / name, cv2.cvtColor(seen.rgba, cv2.COLOR_RGBA2BGRA))
+        if i in labelled or i >= train_views:
+            _write_png(folder / "semantics" / name, seen.part_ids)
+            frame["semantics_path"] = f"semantics/{name}"
+        _write_png(folder / "masks" / name, seen.silhouette.astype(np.uint8) * 255)
+        frames.append({**frame, "transform_matrix": T.tolist(), "object_mask_path": f"masks/{name}"})
+
+    train, test = [f["file_path"] for f in frames[:train_views]], [f["file_path"] for f in frames[train_views:]]
+    transforms = {
+        "camera_model": "OPENCV",
+        "w": size,
+        "h": size,
+        "fl_x": focal,
+        "fl_y": focal,
+        "cx": 0.5 * size,
+        "cy": 0.5 * size,
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+        "semantic_classes": ["background", *scene.ids],
+        "train_filenames": train,
+        "val_filenames": test,
+        "test_filenames": test,
+        "frames": frames,
+    }
+    (folder / "transforms.json").write_text(json.dumps(transforms, indent=1) + "\n", encoding="utf-8")
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    if not cv2.imwrite(str(path), image):
+        raise InputError(f"{path}: the image cannot be written; check the space on the disk.")
+
+
+def _write_points(folder: Path, scene: _Scene, seed: int) -> None:
+    folder.mkdir()
+    for i, surface in scene.placed(scene.configurations[0]).items():
+        points = surface.sample(POINTS_PER_PART, np.random.default_rng([seed, 2, i]))
+        trimesh.PointCloud(points.astype(np.float32)).export(folder / f"part_{i}.ply")
+
+
+def _ground_truth(scene: _Scene, options: SynthesisOptions) -> dict:
+    """ground_truth.json, as data."""
+    robot, start = scene.robot, scene.part_poses(scene.configurations[0])
+    index = {p.name: i for i, p in enumerate(scene.parts)}
+    part_of = {link: p.name for p in scene.parts for link in p.links}
+    link_poses = robot.link_poses(scene.configurations[0])
+
+    def motion(values: Mapping[str, float]) -> dict[str, list]:
+        poses = scene.part_poses(values)
+        return {name: _rounded(poses[name] @ np.linalg.inv(start[name])) for name in poses}
+
+    joints = []
+    for joint in robot.movable:
+        if joint.name in scene.frozen:
+            continue
+        T_world_joint = link_poses[joint.parent] @ joint.T_parent_joint
+        parent, child = part_of[joint.parent], part_of[joint.child]
+        mimic = joint.mimic and {
+            "joint": joint.mimic.joint,
+            "multiplier": joint.mimic.multiplier,
+            "offset": joint.mimic.offset,
+        }
+        joints.append(
+            {
+                "name": joint.name,
+                "type": joint.type,
+                "parent": parent,
+                "child": child,
+                "parent_id": scene.ids.get(parent),
+                "child_id": scene.ids.get(child),
+                "parent_index": index[parent],
+                "child_index": index[child],
+                "axis": _rounded(T_world_joint[:3, :3] @ joint.axis),
+                "origin": _rounded(T_world_joint[:3, 3]),
+                "limits": joint.limits and list(joint.limits),
+                "mimic": mimic,
+                "values": [values[joint.name] for values in scene.configurations],
+            }
+        )
+
+    def moving(values: Mapping[str, float]) -> dict[str, float]:
+        return {name: v for name, v in values.items() if name not in scene.frozen}
+
+    return {
+        "format": "articulated-ground-truth-1",
+        "source": {"urdf": robot.path.name, "robot_name": robot.name, "frozen_joints": scene.frozen},
+        "units": {
+            "length": options.length_unit,
+            "angle": "radian",
+            "poses": "4x4, part frame to world frame",
+            "joint_axis_and_origin": "world frame, at state 0",
+        },
+        "world_frame": "frame of the URDF root link; z is up",
+        "segmentation": {"background": 0, "part_ids": {str(i): name for name, i in scene.ids.items()}},
+        "parts": [
+            {
+                "index": index[p.name],
+                "id": scene.ids.get(p.name),
+                "name": p.name,
+                "has_geometry": p.has_geometry,
+                "root": index[p.name] == 0,
+                "frame_link": p.frame_link,
+                "links": list(p.links),
+            }
+            for p in scene.parts
+        ],
+        "joints": joints,
+        "states": [
+            {
+                "index": k,
+                "folder": f"state_{k:02d}",
+                "joint_values": moving(values),
+                "part_poses": {name: _rounded(T) for name, T in scene.part_poses(values).items()},
+                "motion_from_state_0": motion(values),
+            }
+            for k, values in enumerate(scene.configurations)
+        ],
+        "cameras": {
+            "model": "pinhole",
+            "convention": "OpenGL camera-to-world (x right, y up, looks along -z); pixel centres at +0.5",
+            "look_at": scene.centre.tolist(),
+            "radius": scene.camera_distance(options.fov_degrees),
+            "fov_degrees": options.fov_degrees,
+            "resolution": options.resolution,
+            "object_bounding_radius": scene.radius,
+        },
+        "novel": [
+            {
+                "folder": "eval/novel_00",
+                "joint_values": moving(scene.novel),
+                "motion_from_state_0": motion(scene.novel),
+            }
+        ],
+        "points": f"ground_truth_points/part_<id>.ply: {POINTS_PER_PART} points a part, sampled by area, at state 0",
+    }
+
+
+def _rounded(values: np.ndarray) -> list:
+    return (np.round(values, 9) + 0.0).tolist()
+
+
+@contextmanager
+def _new_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder beside `path`, which takes its place when the block ends well."""
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise InputError(f"{path}: is there already and not empty; give another output folder, or remove it.")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); give another output folder.") from error
+    try:
+        temporary.chmod(0o755)
+        yield temporary
+        if path.exists():
+            path.rmdir()
+        os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)

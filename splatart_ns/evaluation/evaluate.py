@@ -1,0 +1,119 @@
+"""All metrics of a bundle against a capture, as `metrics.json` holds them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatart_ns.bundle.bundle import Bundle
+from splatart_ns.bundle.folder import ARTICULATION, load_bundle
+from splatart_ns.bundle.posing import observed_motions
+from splatart_ns.capture.capture import Capture, State
+from splatart_ns.capture.formats import load_capture, load_novel
+from splatart_ns.capture.view import load_views
+from splatart_ns.errors import InputError
+from splatart_ns.evaluation.geometry import chamfer_centres
+from splatart_ns.evaluation.ground_truth import GroundTruth, load_ground_truth
+from splatart_ns.evaluation.images import image_scores, is_mapped, novel_motions
+from splatart_ns.evaluation.joints import joint_errors, mean_errors
+from splatart_ns.evaluation.parts import part_pose_errors
+from splatart_ns.evaluation.structure import structure_scores
+from splatart_ns.files import write_json
+from splatart_ns.records import read_record
+
+METRICS = "metrics.json"
+
+
+@torch.no_grad()
+def evaluate(bundle_folder: Path, capture_path: Path) -> dict[str, Any]:
+    """Score a bundle and write `metrics.json` into its folder; returns what the file holds.
+
+    A capture without `ground_truth.json` gives image metrics only. Raises InputError for unusable input.
+    """
+    bundle_folder, capture_path = Path(bundle_folder), Path(capture_path)
+    bundle = load_bundle(bundle_folder)
+    capture = load_capture(capture_path)
+    if len(capture.states) != len(bundle.states):
+        raise InputError(
+            f"{bundle_folder / ARTICULATION}: has {len(bundle.states)} states but {capture_path} has "
+            f"{len(capture.states)}; evaluate a bundle on the capture that it was fitted to"
+        )
+    truth = load_ground_truth(capture_path)
+    notes = ["images.lpips: its network's weights are not part of this package"]
+    metrics: dict[str, Any] = {
+        "joints": [],
+        "joints_mean": {},
+        "structure": {},
+        "parts": [],
+        "geometry": {"mesh": None, "centres": None},
+        "images": {},
+        "speed": {},
+    }
+    if truth is None:
+        notes.append("joints, structure, parts, geometry: the capture has no ground_truth.json")
+    else:
+        _score_model(metrics, notes, bundle, truth, len(capture.states), capture_path)
+    _score_images(metrics, notes, bundle, truth, capture, load_novel(capture_path))
+    report = bundle_folder / "report.json"
+    if report.is_file():
+        metrics["speed"] = read_record(report, "run `splatart fit` again").fields
+    else:
+        notes.append("speed: the bundle has no report.json")
+    metrics["notes"] = list(dict.fromkeys(notes))
+    write_json(bundle_folder / METRICS, metrics)
+    return metrics
+
+
+def _score_model(
+    metrics: dict[str, Any],
+    notes: list[str],
+    bundle: Bundle,
+    truth: GroundTruth,
+    num_states: int,
+    capture_path: Path,
+) -> None:
+    if len(truth.motions[truth.root]) != num_states:
+        raise InputError(
+            f"{capture_path / 'ground_truth.json'}: has {len(truth.motions[truth.root])} states but the capture has "
+            f"{num_states}; give the truth of the same states"
+        )
+    for joint in truth.joints:
+        record, note = joint_errors(joint, truth, bundle)
+        metrics["joints"].append(record)
+        if note is not None:
+            notes.append(f"joint {joint.name}: {note}")
+    metrics["joints_mean"] = mean_errors(metrics["joints"])
+    metrics["structure"] = structure_scores(truth, bundle)
+    metrics["parts"] = part_pose_errors(truth, bundle)
+    metrics["geometry"]["centres"] = chamfer_centres(truth, bundle)
+    notes.append("geometry.mesh: part meshes are not extracted")
+
+
+def _score_images(
+    metrics: dict[str, Any],
+    notes: list[str],
+    bundle: Bundle,
+    truth: GroundTruth | None,
+    capture: Capture,
+    novel: Sequence[State],
+) -> None:
+    def score(state: State, motions: dict[str, torch.Tensor]) -> None:
+        split = "test" if state.split("test") else "val"
+        views = load_views(capture, state, split)
+        scores, why = image_scores(bundle, motions, views, capture)
+        metrics["images"][state.name] = scores
+        notes.extend(f"images.{state.name}: {text}" for text in why)
+
+    for index, state in enumerate(capture.states):
+        score(state, observed_motions(bundle, index))
+    for state in novel:
+        true_state = next((n for n in truth.novel if Path(n.folder).name == state.name), None) if truth else None
+        if true_state is None:
+            notes.append(f"images.{state.name}: the truth does not tell its joint values")
+            continue
+        if not is_mapped(bundle, truth):
+            notes.append(f"images.{state.name}: some joints differ in kind from the true ones, their values are scaled")
+        score(state, novel_motions(bundle, truth, true_state))

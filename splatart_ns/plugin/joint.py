@@ -1,0 +1,287 @@
+"""Stages 3 to 5 in nerfstudio: joints, the tree, and a model with one slider a joint."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.viewer.viewer_elements import ViewerSlider
+from torch import Tensor, nn
+
+from splatart_ns.bundle.assemble import assemble_bundle
+from splatart_ns.bundle.bundle import Bundle
+from splatart_ns.bundle.folder import save_bundle
+from splatart_ns.capture.capture import Normalization
+from splatart_ns.errors import InputError
+from splatart_ns.plugin.compat import read_checkpoint
+from splatart_ns.plugin.gaussians import gauss_params_from_splat, splat_from_state
+from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
+from splatart_ns.stages.joint import JointFit
+from splatart_ns.stages.pose import carry
+from splatart_ns.stages.tree import EPSILON, infer_tree
+
+JOINT_TYPES = ("revolute", "prismatic", "screw", "fixed")
+MIN_POINT_OPACITY = 0.3
+"""Fainter Gaussians say little of where a part's surface is."""
+
+
+@dataclass
+class JointModelConfig(SplatartModelConfig):
+    """An articulated splat; the viewer shows one slider a joint."""
+
+    _target: type = field(default_factory=lambda: JointModel)
+
+
+class JointModel(SplatartModel):
+    """Merged parts on a kinematic tree, posed by forward kinematics. Its buffers are in the normalised world."""
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        self.state = self.kwargs["metadata"]["state"]
+        eye = torch.eye(4, dtype=torch.float64).repeat(1, self.num_parts, 1, 1)
+        self._set_joints(self._no_joints() | {"motions": eye})
+
+    @staticmethod
+    def _no_joints() -> dict[str, Tensor]:
+        double = {"dtype": torch.float64}
+        return {
+            "joint_parts": torch.zeros(0, 2, dtype=torch.long),  # parent and child
+            "joint_types": torch.zeros(0, dtype=torch.long),  # of JOINT_TYPES
+            "joint_axes": torch.zeros(0, 3, **double),
+            "joint_origins": torch.zeros(0, 3, **double),
+            "joint_pitches": torch.zeros(0, **double),
+            "joint_values": torch.zeros(0, 1, **double),
+            "root": torch.tensor(1),
+            "motions": torch.zeros(1, 1, 4, 4, **double),
+        }
+
+    def _set_joints(self, buffers: dict[str, Tensor]) -> None:
+        for name, value in buffers.items():
+            self.register_buffer(name, value.to(self.device))
+
+    def start(self, splat: Splat, tree: KinematicTree, motions: Tensor, normalization: Normalization) -> None:
+        """Show `splat` (normalised world) on `tree`; tree and motions [S, P, 4, 4] are in the capture's world."""
+        self.gauss_params = nn.ParameterDict(gauss_params_from_splat(splat.to(self.device)))
+        scale = normalization.scale
+        fits = [j.fit for j in tree.joints]
+        buffers = self._no_joints() | {
+            "root": torch.tensor(tree.root),
+            "motions": torch.from_numpy(normalization.motion_to_normal(motions.cpu().numpy())),
+        }
+        if fits:
+            lengths = torch.tensor([scale if f.type == "prismatic" else 1.0 for f in fits]).double()
+            buffers |= {
+                "joint_parts": torch.tensor([[j.parent, j.child] for j in tree.joints]),
+                "joint_types": torch.tensor([JOINT_TYPES.index(f.type) for f in fits]),
+                "joint_axes": torch.stack([f.axis for f in fits]),
+                "joint_origins": scale
+                * (torch.stack([f.origin for f in fits]) - torch.from_numpy(normalization.centre)),
+                "joint_pitches": torch.tensor([f.pitch * scale for f in fits]).double(),
+                "joint_values": torch.stack([f.values for f in fits]) * lengths[:, None],
+            }
+        self._set_joints(buffers)
+        self.add_sliders(scale)
+
+    @property
+    def tree(self) -> KinematicTree:
+        """The kinematic tree in the normalised world."""
+        joints = []
+        for parts, kind, axis, origin, pitch, values in zip(
+            self.joint_parts.tolist(),
+            self.joint_types.tolist(),
+            self.joint_axes,
+            self.joint_origins,
+            self.joint_pitches.tolist(),
+            self.joint_values,
+            strict=True,
+        ):
+            fit = JointFit(JOINT_TYPES[kind], axis, origin, pitch, values, residual=0.0)
+            joints.append(Joint(*parts, fit))
+        return KinematicTree(list(range(1, self.num_parts + 1)), int(self.root), joints)
+
+    def add_sliders(self, scale: float) -> None:
+        """One slider for each joint that moves, in degrees or the capture's length, over the observed range and half
+        as much on both sides. `scale` is the normalisation's."""
+        self.register_buffer("world_scale", torch.tensor(scale, dtype=torch.float64, device=self.device))
+        for index, joint in enumerate(self.tree.movable):
+            turns = joint.fit.type != "prismatic"
+            unit = math.degrees(1) if turns else 1 / scale
+            low, high = (limit * unit for limit in joint.fit.limits)
+            beyond = 0.5 * (high - low)
+            low, high = low - beyond, high + beyond
+            names = self.part_names[joint.parent], self.part_names[joint.child]
+            slider = ViewerSlider(
+                name=f"{names[0]} to {names[1]} ({'degree' if turns else 'length'})",
+                default_value=float(joint.fit.values[self._shown_state(joint.fit.values)]) * unit,
+                min_value=low,
+                max_value=high,
+                step=(high - low) / 200,
+            )
+            # The viewer finds attributes, not lists of them, and shows them in the order of their names.
+            setattr(self, f"joint_{index:02d}", slider)
+
+    def _shown_state(self, values: Tensor) -> int:
+        return min(self.state, values.shape[-1] - 1)
+
+    def configuration(self) -> Tensor:
+        """What the sliders say [J], radians and normalised length."""
+        q = []
+        for index, joint in enumerate(self.tree.movable):
+            value = getattr(self, f"joint_{index:02d}").value
+            turns = joint.fit.type != "prismatic"
+            q.append(math.radians(value) if turns else value * float(self.world_scale))
+        return torch.tensor(q, dtype=torch.float64, device=self.device)
+
+    @torch.no_grad()
+    def posed_splat(self) -> Splat:
+        """All parts as the sliders say; the root, and parts that hang on nothing, where they are at the state shown."""
+        tree = self.tree
+        motions = self.motions[min(self.state, len(self.motions) - 1)].clone()
+        if tree.movable:
+            T = forward_kinematics(tree, self.configuration(), root_motion=motions[tree.root - 1])
+            hung = [tree.root - 1, *(j.child - 1 for j in tree.joints)]
+            motions[hung] = T[hung]
+        return carry([self.splat], torch.stack([torch.eye(4).to(motions).expand_as(motions), motions]), 0, 1)
+
+    def load_state_dict(self, state, **kwargs):
+        self._set_joints({name: state[name] for name in self._no_joints()})
+        self.add_sliders(float(state["world_scale"]))
+        return super().load_state_dict(state, **kwargs)
+
+
+@dataclass
+class JointPipelineConfig(VanillaPipelineConfig):
+    """Stages 3 and 4."""
+
+    _target: type = field(default_factory=lambda: JointPipeline)
+    pose_run: Path | None = None
+    """The config.yml of the splatart-pose run; the latest under outputs/<capture>/splatart-pose when not given."""
+    root: str | None = None
+    """Name of the part that the others hang on; chosen when not given."""
+    epsilon: float = EPSILON
+    """Largest residual of an accepted joint, as a share of the object's bounding radius."""
+    seed: int = 0
+    """Noted in the bundle."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Noted in the bundle."""
+
+
+class JointPipeline(VanillaPipeline):
+    """Fits joints and tree to the poses of a splatart-pose run."""
+
+    config: JointPipelineConfig
+
+    def __init__(self, config: JointPipelineConfig, device: str, test_mode: str = "val", *args, **kwargs):
+        super().__init__(config, device, test_mode, *args, **kwargs)
+        if test_mode != "val":  # a checkpoint brings everything
+            return
+        capture = self.datamanager.capture
+        normalization = capture.normalization
+        state = read_checkpoint(config.pose_run or find_pose_run(capture.path))
+        splat = splat_from_state(state)
+        ids = splat.part_ids
+        world = splat_to_world(splat, normalization)
+        base = state["_model.poses.base"]
+        motions = torch.from_numpy(normalization.motion_to_world(base.numpy()))
+        covariances = covariances_to_world(state["_model.covariance"], normalization)
+        present = [p for p in capture.parts if bool((ids == p).any())]
+        points = {p: world.means[(ids == p) & (world.opacities > MIN_POINT_OPACITY)].double() for p in present}
+        held = state["_model.held_ratio"]
+        ratios = {
+            (a, b): float(held[a - 1, b - 1])
+            for a in present
+            for b in present
+            if a != b and bool(torch.isfinite(held[a - 1, b - 1]))
+        }
+        root = next((p for p, name in capture.parts.items() if name == config.root), None)
+        if config.root is not None and root not in present:
+            raise InputError(f"{capture.path} has no part '{config.root}' with Gaussians; choose another root.")
+        self.tree = infer_tree(
+            points,
+            {p: motions[:, p - 1] for p in present},
+            covariances={p: covariances[:, p - 1] for p in present},
+            root=root,
+            render_ratios=ratios,
+            epsilon=config.epsilon,
+        )
+        for part, reason in self.tree.unattached.items():
+            CONSOLE.log(f"{capture.parts[part]}: {reason}")
+        self.model.start(splat, self.tree, motions, normalization)
+        self.bundle: Bundle = assemble_bundle(
+            self.tree,
+            {p: world.select(ids == p) for p in capture.parts},
+            {p: motions[:, p - 1] for p in capture.parts},
+            {p: covariances[:, p - 1] for p in capture.parts},
+            capture.parts,
+            [s.name for s in capture.states],
+            capture.length_unit,
+            {"version": version("splatart-ns"), "seed": config.seed, "settings": config.settings},
+        )
+
+
+def splat_to_world(splat: Splat, normalization: Normalization) -> Splat:
+    """A splat of the normalised world in the capture's unit."""
+    out = splat.detach()
+    out.means = out.means / normalization.scale + torch.from_numpy(normalization.centre).to(out.means)
+    out.log_scales = out.log_scales - math.log(normalization.scale)
+    return out
+
+
+def covariances_to_world(covariance: Tensor, normalization: Normalization) -> Tensor:
+    """Covariances [S, P, 6, 6] of left increments (translation, rotation) about the origin, in the capture's world.
+
+    With x_normal = s (x - c), an increment (v, w) becomes (v / s - w x c, w): the rotation is about another origin.
+    """
+    A = torch.eye(6, dtype=torch.float64)
+    A[:3, :3] /= normalization.scale
+    c = torch.from_numpy(normalization.centre)
+    A[:3, 3:] = torch.tensor([[0, -c[2], c[1]], [c[2], 0, -c[0]], [-c[1], c[0], 0]], dtype=torch.float64)
+    return A @ covariance.double() @ A.T
+
+
+def find_pose_run(capture: Path) -> Path:
+    """The latest finished splatart-pose run under outputs/.
+
+    Raises:
+        InputError: when there is none.
+    """
+    folder = Path("outputs") / capture.name / "splatart-pose"
+    runs = [c for c in folder.glob("*/config.yml") if list((c.parent / "nerfstudio_models").glob("step-*.ckpt"))]
+    if not runs:
+        raise InputError(f"{folder} holds no finished run; run `ns-train splatart-pose --data {capture}` first.")
+    return max(runs, key=lambda p: p.stat().st_mtime)
+
+
+@dataclass
+class JointTrainerConfig(TrainerConfig):
+    """A run without training steps: joints are fitted, the checkpoint and the bundle are written."""
+
+    _target: type = field(default_factory=lambda: JointTrainer)
+    bundle_dir: Path | None = None
+    """Where the bundle goes; the run's folder `bundle` when not given."""
+
+
+class JointTrainer(Trainer):
+    """Writes what the pipeline found and, with the viewer on, shows it."""
+
+    config: JointTrainerConfig
+
+    def train(self) -> None:
+        self.pipeline.datamanager.train_dataparser_outputs.save_dataparser_transform(
+            self.base_dir / "dataparser_transforms.json"
+        )
+        folder = self.config.bundle_dir or self.base_dir / "bundle"
+        save_bundle(self.pipeline.bundle, folder)
+        CONSOLE.print(f"Bundle: {folder}")
+        self._init_viewer_state()
+        self.pipeline.eval()
+        self._after_train()

@@ -1,0 +1,280 @@
+"""Stage 2 in nerfstudio: part poses over all states, then one splat per part from all of them."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.models.base_model import Model
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor, nn
+
+from splatart_ns.capture.view import View, load_views
+from splatart_ns.errors import InputError
+from splatart_ns.plugin.compat import read_checkpoint, read_run_config
+from splatart_ns.plugin.gaussians import gauss_params_from_splat, splat_from_state
+from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
+from splatart_ns.rasterize.render import render
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.merge import merge_parts
+from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
+from splatart_ns.stages.pose_evidence import motion_covariances, rotation_held_ratios
+from splatart_ns.stages.render_choice import initial_motion
+
+
+@dataclass
+class PoseModelConfig(SplatartModelConfig):
+    """Poses by rendering every state's parts at every other state, then Gaussians merged from all states."""
+
+    _target: type = field(default_factory=lambda: PoseModel)
+    pose_steps: int = 200
+    """Steps on the poses; after them the Gaussians of all states are merged and learn."""
+    learn_gaussians: Literal["after", "along"] = "after"
+    """Whether Gaussians wait until the poses are found, or learn along with them as in the paper."""
+    loss_weights: PoseLossWeights = field(default_factory=PoseLossWeights)
+    """Weights of the four losses."""
+
+
+class PoseModel(SplatartModel):
+    """First the labelled splats of all states and a pose for every part and state, then the merged parts."""
+
+    config: PoseModelConfig
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        self.state = self.kwargs["metadata"]["state"]
+        self.register_buffer("state_ids", torch.zeros(self.num_points, dtype=torch.long))
+        self.register_buffer("merged", torch.tensor(False))
+        self.register_buffer("covariance", torch.zeros(1, self.num_parts, 6, 6, dtype=torch.float64))
+        self.register_buffer("held_ratio", torch.full((self.num_parts, self.num_parts), torch.nan))
+        eye = torch.eye(4, dtype=torch.float64).repeat(1, self.num_parts, 1, 1)
+        self.poses = PartPoses(eye, torch.zeros(self.num_parts, 3), torch.ones(self.num_parts))
+
+    def start(self, splats: list[Splat], base: Tensor, frozen: Tensor) -> None:
+        """Begin from one splat per state and initial poses [S, P, 4, 4]; `frozen` [S, P] ones stay."""
+        self.gauss_params = nn.ParameterDict(gauss_params_from_splat(Splat.cat(splats).to(self.device)))
+        self.state_ids = torch.cat([torch.full((len(s),), k) for k, s in enumerate(splats)]).to(self.device)
+        self.merged = torch.tensor(False, device=self.device)
+        self.poses = PartPoses(base, *part_extents(splats[0], self.num_parts), frozen).to(self.device)
+        self.covariance = torch.zeros(*base.shape[:2], 6, 6, dtype=torch.float64, device=self.device)
+
+    @property
+    def num_states(self) -> int:
+        return self.poses.base.shape[0]
+
+    def state_splat(self, state: int) -> Splat:
+        """The Gaussians that came from one state, before the merger."""
+        return self.splat.select(self.state_ids == state)
+
+    def splat_at(self, state: int, T: Tensor) -> Splat:
+        """The merged Gaussians at an observed state, T [S, P, 4, 4]."""
+        return carry([self.splat], T[[0, state]], 0, 1)
+
+    @torch.no_grad()
+    def posed_splat(self) -> Splat:
+        if not self.merged:
+            return self.state_splat(self.state)
+        return self.splat_at(self.state, self.poses.T())
+
+    def load_state_dict(self, state, **kwargs):
+        for name in ("state_ids", "covariance", "held_ratio"):
+            setattr(self, name, torch.zeros_like(state[name], device=self.device))
+        base = state["poses.base"].to(self.device)
+        eye = torch.eye(4, dtype=torch.float64, device=self.device).expand_as(base).clone()
+        self.poses = PartPoses(eye, *(state[f"poses.{k}"].to(self.device) for k in ("centroids", "radii")))
+        return super().load_state_dict(state, **kwargs)
+
+
+@dataclass
+class PosePipelineConfig(VanillaPipelineConfig):
+    """Stage 2."""
+
+    _target: type = field(default_factory=lambda: PosePipeline)
+    semantic_runs: tuple[Path, ...] = ()
+    """The config.yml of each state's splatart-semantic run, in the order of the states; found under
+    outputs/<capture>/splatart-semantic when not given."""
+    init: Literal["registration", "centroids", "file"] = "registration"
+    """How poses start: many-start ICP chosen by rendering, parts' centroids, or `init_file`."""
+    init_file: Path | None = None
+    """JSON with "motion": [state][part] 4x4 matrices, world at state 0 to that state, in the capture's unit."""
+    snap: bool = True
+    """Whether parts whose images fit no motion are held still."""
+    seed: int = 0
+    """Seed of the registration and of the order of views."""
+
+
+class PosePipeline(VanillaPipeline):
+    """Estimates T[state][part] over all states of a capture, then merges and polishes the parts' Gaussians."""
+
+    config: PosePipelineConfig
+
+    def __init__(self, config: PosePipelineConfig, device: str, test_mode: str = "val", *args, **kwargs):
+        super().__init__(config, device, test_mode, *args, **kwargs)
+        if test_mode != "val":  # a checkpoint brings everything
+            return
+        capture = self.datamanager.capture
+        self.views: list[list[View]] = [
+            [v.to(device) for v in load_views(capture, s, "train")] for s in range(len(capture.states))
+        ]
+        runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
+        splats = [self._load_splat(run).to(device) for run in runs]
+        base, frozen = self._initial_poses(splats)
+        self.model.start(splats, base, frozen)
+        self._pairs = self._shuffled_pairs()
+        self._own = self._shuffled_views()
+
+    def _load_splat(self, run: Path) -> Splat:
+        """A state's labelled Gaussians without the background's."""
+        splat = splat_from_state(read_checkpoint(run))
+        if splat.part_logits.shape[1] != self.model.num_parts + 1:
+            raise InputError(
+                f"{run} was trained with {splat.part_logits.shape[1] - 1} parts and the capture has "
+                f"{self.model.num_parts}; train splatart-semantic again."
+            )
+        return splat.select(splat.part_ids > 0)
+
+    def _initial_poses(self, splats: list[Splat]) -> tuple[Tensor, Tensor]:
+        """Base poses [S, P, 4, 4] and which of them stay as they are [S, P]."""
+        S, P = len(splats), self.model.num_parts
+        base = torch.eye(4, dtype=torch.float64).repeat(S, P, 1, 1)
+        frozen = torch.zeros(S, P, dtype=torch.bool)
+        if self.config.init == "file":
+            return self._poses_from_file(base), frozen
+        centroids = [part_extents(s, P)[0].cpu() for s in splats]
+        for s in range(1, S):
+            for p in range(P):
+                if self.config.init == "centroids":
+                    base[s, p, :3, 3] = centroids[s][p] - centroids[0][p]
+                    continue
+                pair = (splats[0], splats[s]), (self.views[0], self.views[s])
+                motion = initial_motion(*pair, p + 1, self.config.seed)
+                name = f"part {self.model.part_names[p + 1]}, state {s}"
+                if not motion.found:
+                    CONSOLE.log(f"{name}: too few Gaussians to register; it is held still")
+                base[s, p] = motion.T.cpu()
+                frozen[s, p] = not motion.found or (self.config.snap and motion.still)
+        return base, frozen
+
+    def _poses_from_file(self, base: Tensor) -> Tensor:
+        from splatart_ns.bundle.motion_file import read_motions
+
+        motions = read_motions(self.config.init_file, tuple(base.shape[:2]))
+        return torch.from_numpy(self.datamanager.capture.normalization.motion_to_normal(motions)).to(base)
+
+    def _shuffled_pairs(self) -> Iterator[tuple[int, int, View]]:
+        """(source, target, target view): all pairs of states in turn, both ways round, every view of a state before
+        any again."""
+        rng = random.Random(self.config.seed)
+        S = len(self.views)
+        queues: list[list[View]] = [[] for _ in range(S)]
+        while True:
+            pairs = [(a, b) for a in range(S) for b in range(S) if a < b]
+            rng.shuffle(pairs)
+            for a, b in pairs:
+                for source, target in ((a, b), (b, a)):
+                    if not queues[target]:
+                        queues[target] = rng.sample(self.views[target], len(self.views[target]))
+                    yield source, target, queues[target].pop()
+
+    def _shuffled_views(self) -> Iterator[tuple[int, View]]:
+        """(state, view): every view of every state before any again."""
+        rng = random.Random(self.config.seed)
+        while True:
+            everything = [(s, v) for s, views in enumerate(self.views) for v in views]
+            yield from rng.sample(everything, len(everything))
+
+    def get_train_loss_dict(self, step: int):
+        model = self.model
+        T = model.poses.T()
+        losses: dict[str, Tensor] = {}
+        background = torch.rand(3, device=model.device)
+        if model.merged:
+            state, view = next(self._own)
+            shots = [(model.splat_at(state, T.detach()), view)]
+        else:
+            shots = []
+            for _ in range(2):
+                source, target, view = next(self._pairs)
+                splats = {source: self._frozen_splat(source)}
+                shots.append((carry(splats, T, source, target), view))
+        for splat, view in shots:
+            rendering = render(
+                splat,
+                view.viewmat[None],
+                view.K[None],
+                view.width,
+                view.height,
+                features=splat.part_probabilities,
+                with_depth=False,
+            )
+            for name, loss in pose_loss(rendering, view, model.config.loss_weights, background).items():
+                losses[name] = losses.get(name, 0) + loss / len(shots)
+        return {}, losses, {"gaussian_count": model.num_points}
+
+    def _frozen_splat(self, state: int) -> Splat:
+        """What moves while poses are sought: a state's Gaussians without those that straddle two parts."""
+        splat = self.model.state_splat(state)
+        if self.model.config.learn_gaussians == "along":
+            return splat
+        splat = splat.detach()
+        return splat.select(unmixed(splat))
+
+    def get_training_callbacks(self, training_callback_attributes) -> list[TrainingCallback]:
+        optimizers = training_callback_attributes.optimizers.optimizers
+
+        def merge(step: int) -> None:
+            if step == self.model.config.pose_steps:
+                self._merge(optimizers)
+
+        def count(step: int) -> None:
+            self.model.step = step
+
+        before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+        return [TrainingCallback(before, merge), TrainingCallback(before, count)]
+
+    @torch.no_grad()
+    def _merge(self, optimizers: dict[str, torch.optim.Optimizer]) -> None:
+        """End the search for poses: note their certainty, then keep one set of Gaussians, in the canonical frame."""
+        model = self.model
+        model.poses.commit()
+        T = model.poses.T()
+        splats = [model.state_splat(s).detach() for s in range(model.num_states)]
+        model.covariance = motion_covariances(splats, self.views, T)
+        model.held_ratio = rotation_held_ratios(splats, self.views, T)
+        merged = Splat.cat(merge_parts(splats, self.views, T))
+        params = gauss_params_from_splat(merged)
+        for name, parameter in params.items():
+            model.gauss_params[name] = parameter
+            optimizers[name].param_groups[0]["params"] = [parameter]
+            optimizers[name].state.clear()
+        model.state_ids = torch.zeros(len(merged), dtype=torch.long, device=model.device)
+        model.merged = torch.tensor(True, device=model.device)
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {**super().get_param_groups(), "part_poses": list(self.model.poses.parameters())}
+
+
+def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
+    """The latest splatart-semantic run of each state under outputs/.
+
+    Raises:
+        InputError: naming a state that has none.
+    """
+    folder = Path("outputs") / capture.name / "splatart-semantic"
+    found: dict[int, Path] = {}
+    for config in sorted(folder.glob("*/config.yml"), key=lambda p: p.stat().st_mtime):
+        if list((config.parent / "nerfstudio_models").glob("step-*.ckpt")):
+            found[read_run_config(config)["pipeline"]["datamanager"]["dataparser"]["state"]] = config
+    for state in range(num_states):
+        if state not in found:
+            raise InputError(
+                f"{folder} holds no finished run of state {state}; run `ns-train splatart-semantic --data {capture} "
+                f"splatart-capture --state {state}` first."
+            )
+    return tuple(found[s] for s in range(num_states))

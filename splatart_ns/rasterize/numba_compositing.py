@@ -1,0 +1,296 @@
+"""Compositing of the pairs of each tile, front to back, and its gradient, back to front.
+
+A tile's 64 pixels lie side by side in one small workspace, at fixed offsets, so that every inner loop runs over them in
+vector registers: LLVM vectorises them only where it sees that nothing overlaps. The first four channels of colour
+share the workspace and the loops of the geometry; each further channel has a row and loops of its own.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from splatart_ns.rasterize.numba_binning import PIXELS, TILE
+from splatart_ns.rasterize.numba_threads import JIT
+
+MIN_CHANNELS = 4
+"""The least number of channels: fewer are padded."""
+
+_LOG2_ALPHA_MIN = np.float32(math.log2(1 / 255))
+_LOG2_ALPHA_MAX = np.float32(math.log2(0.999))
+_LN_2 = math.log(2)
+_T_MIN = np.float32(1e-4)
+_ZERO, _ONE = np.float32(0), np.float32(1)
+# Near-minimax fit of 2^f for f in [0, 1], relative error 7.5e-8.
+_E0, _E1, _E2 = np.float32(0.9999999250636943), np.float32(0.6931530731907609), np.float32(0.24015361712565741)
+_E3, _E4, _E5 = np.float32(0.05582631781272315), np.float32(0.00898934037714072), np.float32(0.0018775765567582148)
+
+# Offsets in the workspace of a tile.
+_X, _Y, _T, _W, _A, _COLOR = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIXELS, 5 * PIXELS
+
+
+@njit(**JIT)
+def _alpha(log2_alpha):
+    """2^log2_alpha, cut to 0 below 1/255 and to 0.999."""
+    exponent = min(max(log2_alpha, np.float32(-9)), _LOG2_ALPHA_MAX)
+    whole = math.floor(exponent)
+    f = exponent - np.float32(whole)
+    power = ((((_E5 * f + _E4) * f + _E3) * f + _E2) * f + _E1) * f + _E0
+    scale = np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
+    return power * scale if log2_alpha >= _LOG2_ALPHA_MIN else _ZERO
+
+
+@njit(**JIT)
+def _at_tile(coefficients, left, top):
+    """u0, y0, f, s, h, k, such that log2(alpha) = f (u0 + x + s y)^2 + h (y0 + y)^2 + k in the tile's coordinates x, y.
+
+    For needles u0 is a small difference: it is taken in float64.
+    """
+    x, y, f, s, h, k = coefficients
+    u0 = (left - x) + s * (top - y)
+    return np.float32(u0), np.float32(top - y), np.float32(f), np.float32(s), np.float32(h), np.float32(k)
+
+
+@njit(**JIT)
+def _start_tile(work):
+    """Fills in the tile-local pixel coordinates and full transmittance."""
+    for p in range(PIXELS):
+        work[_X + p] = np.float32(p % TILE)
+        work[_Y + p] = np.float32(p // TILE)
+        work[_T + p] = _ONE
+
+
+@njit(**JIT)
+def composite(begin, end, worker, bins, colors, render, alphas, depths):
+    """Renders the tiles begin..end into render [C, H, W, D] and alphas [C, H, W, 1].
+
+    colors are [G, max(D, MIN_CHANNELS)]. depths [tiles] receives how many pairs of each tile
+    were used before all its pixels were saturated.
+    """
+    tiles_x, tiles_y, tile_offsets, gaussians = bins.tiles_x, bins.tiles_y, bins.tile_offsets, bins.gaussians
+    coefficients = bins.coefficients
+    height, width, channels = render.shape[1], render.shape[2], render.shape[3]
+    work = np.empty(_COLOR + MIN_CHANNELS * PIXELS, np.float32)
+    more = np.empty((colors.shape[1] - MIN_CHANNELS, PIXELS), np.float32)
+    for tile in range(begin, end):
+        row, column = (tile // tiles_x) % tiles_y, tile % tiles_x
+        left, top = column * TILE + 0.5, row * TILE + 0.5
+        _start_tile(work)
+        work[_COLOR:] = _ZERO
+        more[:] = _ZERO
+        pair = tile_offsets[tile]
+        while pair < tile_offsets[tile + 1]:
+            g = gaussians[pair]
+            u0, y0, square, shear, drop, peak = _at_tile(coefficients[g], left, top)
+            c0, c1, c2, c3 = colors[g, 0], colors[g, 1], colors[g, 2], colors[g, 3]
+            for p in range(PIXELS):
+                dy = work[_Y + p] + y0
+                u = work[_X + p] + (shear * work[_Y + p] + u0)
+                alpha = _alpha(square * u * u + (drop * dy * dy + peak))
+                t = work[_T + p]
+                weight = alpha * t
+                rest = t - weight
+                # The sign marks saturated pixels, which keep their transmittance.
+                alive = rest > _T_MIN
+                weight = weight if alive else _ZERO
+                work[_T + p] = rest if alive else -abs(t)
+                work[_W + p] = weight
+                work[_COLOR + p] += weight * c0
+                work[_COLOR + PIXELS + p] += weight * c1
+                work[_COLOR + 2 * PIXELS + p] += weight * c2
+                work[_COLOR + 3 * PIXELS + p] += weight * c3
+            for d in range(more.shape[0]):
+                c = colors[g, MIN_CHANNELS + d]
+                for p in range(PIXELS):
+                    more[d, p] += work[_W + p] * c
+            pair += 1
+            if pair & 7 == 0:
+                most = -_ONE
+                for p in range(PIXELS):
+                    most = max(most, work[_T + p])
+                if most < _ZERO:
+                    break
+        depths[tile] = pair - tile_offsets[tile]
+        camera = tile // (tiles_x * tiles_y)
+        for i in range(min(TILE, height - row * TILE)):
+            for j in range(min(TILE, width - column * TILE)):
+                p = i * TILE + j
+                alphas[camera, row * TILE + i, column * TILE + j, 0] = _ONE - abs(work[_T + p])
+                for d in range(min(channels, MIN_CHANNELS)):
+                    render[camera, row * TILE + i, column * TILE + j, d] = work[_COLOR + d * PIXELS + p]
+                for d in range(MIN_CHANNELS, channels):
+                    render[camera, row * TILE + i, column * TILE + j, d] = more[d - MIN_CHANNELS, p]
+
+
+@njit(**JIT)
+def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alphas, wants, moments, v_colors):
+    """Gradients of the tiles begin..end's pairs, by slot.
+
+    wants: whether to fill moments, its columns for absgrad, and v_colors [E, max(D, MIN_CHANNELS)].
+    moments [E, 6 or 8], with v the gradient of a pixel's ln(alpha) and u = dx + s dy, are the sums over the tile of v
+    times 1, u, dy, u^2, u dy, dy^2, and the absolute gradients of the mean's x and y.
+    """
+    tiles_x, tiles_y, tile_offsets, gaussians, slots = (
+        bins.tiles_x,
+        bins.tiles_y,
+        bins.tile_offsets,
+        bins.gaussians,
+        bins.slots,
+    )
+    coefficients = bins.coefficients
+    want_moments, want_abs, want_colors = wants
+    height, width, channels = v_render.shape[1], v_render.shape[2], v_render.shape[3]
+    work = np.empty(_COLOR + MIN_CHANNELS * PIXELS, np.float32)
+    more = np.empty((colors.shape[1] - MIN_CHANNELS, PIXELS), np.float32)
+    saved = np.empty((1024, 2 * PIXELS), np.float32)
+    for tile in range(begin, end):
+        row, column = (tile // tiles_x) % tiles_y, tile % tiles_x
+        left, top = column * TILE + 0.5, row * TILE + 0.5
+        start, count = tile_offsets[tile], depths[tile]
+        for pair in range(start + count, tile_offsets[tile + 1]):
+            if want_moments:
+                moments[slots[pair]] = _ZERO
+            if want_colors:
+                v_colors[slots[pair]] = _ZERO
+        if count == 0:
+            continue
+        _start_tile(work)
+        if count > saved.shape[0]:
+            saved = np.empty((2 * count, 2 * PIXELS), np.float32)
+        for k in range(count):
+            g = gaussians[start + k]
+            u0, y0, square, shear, drop, peak = _at_tile(coefficients[g], left, top)
+            save = saved[k]
+            for p in range(PIXELS):
+                dy = work[_Y + p] + y0
+                u = work[_X + p] + (shear * work[_Y + p] + u0)
+                log2_alpha = square * u * u + (drop * dy * dy + peak)
+                alpha = _alpha(log2_alpha)
+                t = work[_T + p]
+                weight = alpha * t
+                rest = t - weight
+                alive = rest > _T_MIN
+                work[_T + p] = rest if alive else -abs(t)
+                # The sign marks alphas that were cut to 0.999.
+                alpha = -alpha if log2_alpha > _LOG2_ALPHA_MAX else alpha
+                save[p] = alpha if alive else _ZERO
+                save[PIXELS + p] = weight if alive else _ZERO
+        camera = tile // (tiles_x * tiles_y)
+        work[_COLOR:] = _ZERO
+        more[:] = _ZERO
+        # The transmittance is no longer needed; in its place comes the gradient of alpha, 0 beyond the image's edge.
+        for p in range(PIXELS):
+            work[_T + p] = _ZERO
+            work[_A + p] = _ZERO
+        for i in range(min(TILE, height - row * TILE)):
+            for j in range(min(TILE, width - column * TILE)):
+                p = i * TILE + j
+                work[_T + p] = v_alphas[camera, row * TILE + i, column * TILE + j, 0]
+                for d in range(min(channels, MIN_CHANNELS)):
+                    work[_COLOR + d * PIXELS + p] = v_render[camera, row * TILE + i, column * TILE + j, d]
+                for d in range(MIN_CHANNELS, channels):
+                    more[d - MIN_CHANNELS, p] = v_render[camera, row * TILE + i, column * TILE + j, d]
+        # work[_A] holds what lies behind the pair, composited and dotted with the image gradient.
+        for k in range(count - 1, -1, -1):
+            g, slot = gaussians[start + k], slots[start + k]
+            save = saved[k]
+            if want_moments:
+                for p in range(PIXELS):
+                    work[_W + p] = work[_T + p]
+                for d in range(more.shape[0]):
+                    c = colors[g, MIN_CHANNELS + d]
+                    for p in range(PIXELS):
+                        work[_W + p] += more[d, p] * c
+                c0, c1, c2, c3 = colors[g, 0], colors[g, 1], colors[g, 2], colors[g, 3]
+                u0, y0, square, shear, drop, _ = _at_tile(coefficients[g], left, top)
+                m, mu, my, muu, muy, myy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+                for p in range(PIXELS):
+                    alpha = save[p]
+                    color = (
+                        work[_W + p]
+                        + c0 * work[_COLOR + p]
+                        + c1 * work[_COLOR + PIXELS + p]
+                        + c2 * work[_COLOR + 2 * PIXELS + p]
+                        + c3 * work[_COLOR + 3 * PIXELS + p]
+                    )
+                    difference = color - work[_A + p]
+                    work[_A + p] += abs(alpha) * difference
+                    v = save[PIXELS + p] * difference if alpha > _ZERO else _ZERO
+                    work[_W + p] = v
+                    dy = work[_Y + p] + y0
+                    u = work[_X + p] + (shear * work[_Y + p] + u0)
+                    vu, vy = v * u, v * dy
+                    m += v
+                    mu += vu
+                    my += vy
+                    muu += vu * u
+                    muy += vu * dy
+                    myy += vy * dy
+                moments[slot, 0] = m
+                moments[slot, 1] = mu
+                moments[slot, 2] = my
+                moments[slot, 3] = muu
+                moments[slot, 4] = muy
+                moments[slot, 5] = myy
+                if want_abs:
+                    ax, ay = _ZERO, _ZERO
+                    for p in range(PIXELS):
+                        v = work[_W + p]
+                        dy = work[_Y + p] + y0
+                        slope_x = square * (work[_X + p] + (shear * work[_Y + p] + u0))
+                        ax += abs(v * slope_x)
+                        ay += abs(v * (shear * slope_x + drop * dy))
+                    moments[slot, 6] = ax
+                    moments[slot, 7] = ay
+            if want_colors:
+                v0, v1, v2, v3 = _ZERO, _ZERO, _ZERO, _ZERO
+                for p in range(PIXELS):
+                    weight = save[PIXELS + p]
+                    v0 += weight * work[_COLOR + p]
+                    v1 += weight * work[_COLOR + PIXELS + p]
+                    v2 += weight * work[_COLOR + 2 * PIXELS + p]
+                    v3 += weight * work[_COLOR + 3 * PIXELS + p]
+                v_colors[slot, 0] = v0
+                v_colors[slot, 1] = v1
+                v_colors[slot, 2] = v2
+                v_colors[slot, 3] = v3
+                for d in range(more.shape[0]):
+                    v0 = _ZERO
+                    for p in range(PIXELS):
+                        v0 += save[PIXELS + p] * more[d, p]
+                    v_colors[slot, MIN_CHANNELS + d] = v0
+
+
+@njit(**JIT)
+def gather_gradients(
+    begin, end, worker, bins, moments, pair_colors, wants, v_means, v_conics, v_opacities, v_colors, absgrad
+):
+    """Sums the slots of the sorted Gaussians begin..end into gradients [G, .]."""
+    order, slot_offsets, coefficients = bins.order, bins.slot_offsets, bins.coefficients
+    want_moments, want_abs, want_colors = wants
+    total = np.empty(8)
+    for k in range(begin, end):
+        g = order[k]
+        if want_moments:
+            total[:] = 0.0
+            for slot in range(slot_offsets[k], slot_offsets[k + 1]):
+                for i in range(moments.shape[1]):
+                    total[i] += moments[slot, i]
+            _, _, f, s, h, peak = coefficients[g]
+            m, mu, my, muu, muy, myy, ax, ay = total
+            # log2(alpha) carries log2(e) times the exponent -q / 2, of which the conic's entries are half a derivative.
+            v_means[g, 0] = -2 * _LN_2 * f * mu
+            v_means[g, 1] = -2 * _LN_2 * (s * f * mu + h * my)
+            v_conics[g, 0] = -0.5 * (muu - 2 * s * muy + s * s * myy)
+            v_conics[g, 1] = -(muy - s * myy)
+            v_conics[g, 2] = -0.5 * myy
+            v_opacities[g, 0] = m * 2.0**-peak
+            if want_abs:
+                absgrad[g, 0] = 2 * _LN_2 * ax
+                absgrad[g, 1] = 2 * _LN_2 * ay
+        if want_colors:
+            for slot in range(slot_offsets[k], slot_offsets[k + 1]):
+                for d in range(v_colors.shape[1]):
+                    v_colors[g, d] += pair_colors[slot, d]

@@ -1,0 +1,68 @@
+"""Canonical part splats: each part from the state that shows it best, completed by what only other states show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from splatart_ns.capture.view import View
+from splatart_ns.geometry.se3 import inverse, matrix_from_quat
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.visibility import SEEN, visibility
+
+MIN_OPACITY = 0.02
+COVERED = 2.0
+"""A centre within so many standard deviations of a Gaussian is where that Gaussian already is."""
+
+
+def merge_parts(splats: Sequence[Splat], views: Sequence[Sequence[View]], T: Tensor) -> list[Splat]:
+    """The splats of parts 1..P in the canonical frame, from all states.
+
+    Args:
+        splats: One labelled splat per state.
+        views: Training views of each state; they decide which Gaussians are seen.
+        T: Poses [S, P, 4, 4].
+
+    Returns:
+        One splat per part; empty for a part without Gaussians. Background and unseen Gaussians are gone.
+    """
+    seen = [visibility(s, v) for s, v in zip(splats, views, strict=True)]
+    footprint = _pixel_footprint(views[0])
+    return [_merge_part(splats, seen, T[:, p], p + 1, footprint) for p in range(T.shape[1])]
+
+
+def _pixel_footprint(views: Sequence[View]) -> float:
+    """Median size of a pixel at the world's origin, length."""
+    return float(torch.tensor([float(v.viewmat[:3, 3].norm() / v.K[0, 0]) for v in views]).median())
+
+
+def _merge_part(splats: Sequence[Splat], seen: Sequence[Tensor], T: Tensor, part: int, footprint: float) -> Splat:
+    pieces, shown = [], []
+    for splat, most, pose in zip(splats, seen, T, strict=True):
+        needed = (splat.part_ids == part) & (splat.opacities > MIN_OPACITY) & (most > SEEN)
+        pieces.append(splat.select(needed).detach().transformed(inverse(pose)))
+        shown.append(float(most[needed].sum()))
+    order = sorted(range(len(pieces)), key=lambda s: -shown[s])
+    merged = pieces[order[0]]
+    for s in order[1:]:
+        merged = Splat.cat([merged, pieces[s].select(~covered(pieces[s].means, merged, footprint))])
+    return merged
+
+
+def covered(points: Tensor, splat: Splat, footprint: float) -> Tensor:
+    """Which points [N, 3] lie within `COVERED` standard deviations of a Gaussian of `splat` [N] bool.
+
+    The Gaussians count as blurred by `footprint`, length. Each point is tried against the nearest few.
+    """
+    if len(points) == 0 or len(splat) == 0:
+        return torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    k = min(16, len(splat))
+    nearest = cKDTree(splat.means.cpu().numpy()).query(points.cpu().numpy(), k=k)[1].reshape(-1, k)
+    nearest = torch.from_numpy(nearest).to(points.device)
+    axes = matrix_from_quat(splat.quats)[nearest]
+    own = (axes.mT @ (points[:, None] - splat.means[nearest])[..., None])[..., 0]
+    variance = splat.scales[nearest].square() + footprint**2
+    return ((own.square() / variance).sum(-1) < COVERED**2).any(-1)

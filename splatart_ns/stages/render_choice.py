@@ -1,0 +1,82 @@
+"""Initial motions of all parts: registration proposes, renderings into the other state's views choose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatart_ns.capture.view import View
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.part_pair import PartPair, part_pair
+from splatart_ns.stages.refinement import refine
+from splatart_ns.stages.registration import MIN_POINTS, distinct, part_points, point_to_plane, register
+
+VIEWS = 5
+"""Views of each state that are compared."""
+COARSE_PIXELS = 1500
+"""Choosing needs no more pixels a view than this."""
+FINE_PIXELS = 10000
+"""Refining needs as many; coarse images would bias it (POSES.md, section 4)."""
+SIMILAR = 2.5
+"""Candidates that cost more than this many times the best are dropped before refining."""
+STILL_RATIO = 1.2
+"""A part whose images fit no motion worse than this many times the best motion did not move."""
+
+
+@dataclass(frozen=True)
+class InitialMotion:
+    """A part's motion from state 0 to another state, before the poses of all parts are refined together."""
+
+    T: Tensor
+    """[4, 4] float64."""
+    found: bool
+    """False when the part has too few Gaussians in one of the states; T is then the identity."""
+    still: bool = False
+    """Whether the part did not move; T is then the identity."""
+    cost: float = float("nan")
+    """Mean Huber cost per pixel of the part (see part_pair)."""
+    identity_ratio: float = float("nan")
+    """Cost of no motion over the best cost."""
+    runner_up_ratio: float = float("inf")
+    """Cost of the best candidate that ended elsewhere over the best cost: near 1, the choice was ambiguous."""
+
+
+def initial_motion(
+    splats: tuple[Splat, Splat], views: tuple[Sequence[View], Sequence[View]], part: int, seed: int = 0
+) -> InitialMotion:
+    """The motion of one part between two states, `splats` and `views` (training views) of the one and the other."""
+    source, target = (part_points(s, part) for s in splats)
+    identity = torch.eye(4, dtype=torch.float64, device=splats[0].means.device)
+    if min(len(source.xyz), len(target.xyz)) < MIN_POINTS:
+        return InitialMotion(identity, found=False)
+    found = register(source, target, seed).T
+    candidates = torch.from_numpy(np.concatenate([found, point_to_plane(source, target, found)])).to(identity)
+    coarse = part_pair(splats, views, part, VIEWS, COARSE_PIXELS)
+    fine = part_pair(splats, views, part, VIEWS, FINE_PIXELS)
+    if coarse is None or fine is None:
+        return InitialMotion(candidates[0], found=True)
+    ends = [refine(fine, T, max_iterations=4) for T in choose(coarse, torch.cat([identity[None], candidates]))]
+    cost = np.array([e.cost for e in ends])
+    order = distinct(torch.stack([e.T for e in ends]).cpu().numpy(), cost, source.centroid, source.radius)
+    best = ends[order[0]]
+    identity_ratio = float(fine.cost(identity[None])[0]) / max(best.cost, 1e-12)
+    still = identity_ratio < STILL_RATIO
+    return InitialMotion(
+        identity if still else best.T,
+        found=True,
+        still=still,
+        cost=best.cost,
+        identity_ratio=identity_ratio,
+        runner_up_ratio=cost[order[1]] / max(best.cost, 1e-12) if len(order) > 1 else float("inf"),
+    )
+
+
+def choose(pair: PartPair, candidates: Tensor, keep: int = 3) -> Tensor:
+    """The distinct motions [K, 4, 4] among `candidates` [C, 4, 4] that render best, best first."""
+    cost = pair.cost(candidates).cpu().numpy()
+    order = distinct(candidates.cpu().numpy(), cost, pair.centroid.cpu().numpy(), pair.radius)
+    return candidates[[i for i in order[:keep] if cost[i] <= SIMILAR * cost[order[0]]]]

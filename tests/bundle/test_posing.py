@@ -1,0 +1,83 @@
+import math
+
+import pytest
+import torch
+
+from splatart_ns.bundle import (
+    Joint,
+    configured_motions,
+    joint_motion,
+    moved_splat,
+    observed_motions,
+    observed_values,
+    part_features,
+    posed_splat,
+)
+
+D = torch.float64
+
+
+def joint(kind: str, pitch: float = 0.0) -> Joint:
+    axis, origin = torch.tensor([0.0, 0, 1], dtype=D), torch.tensor([1.0, 0, 0], dtype=D)
+    return Joint("j", kind, "a", "b", axis, origin, torch.zeros(2, dtype=D), None, pitch=pitch)
+
+
+@pytest.mark.parametrize(
+    ("kind", "pitch", "value", "expected"),
+    [
+        ("revolute", 0.0, math.pi / 2, [1.0, 1.0, 0.0]),
+        ("prismatic", 0.0, 0.5, [2.0, 0.0, 0.5]),
+        ("screw", 0.1, math.pi, [0.0, 0.0, 0.1 * math.pi]),
+        ("cylindrical", 0.0, [0.3, math.pi / 2], [1.0, 1.0, 0.3]),
+        ("spherical", 0.0, [0.0, math.pi / 2, 0.0], [1.0, 0.0, -1.0]),
+        ("free", 0.0, [1.0, 2.0, 3.0, 0.0, 0.0, 0.0], [3.0, 2.0, 3.0]),
+        ("fixed", 0.0, 0.0, [2.0, 0.0, 0.0]),
+    ],
+)
+def test_a_point_moves_as_the_joint_says(kind, pitch, value, expected):
+    T = joint_motion(joint(kind, pitch), value)
+    moved = T[:3, :3] @ torch.tensor([2.0, 0, 0], dtype=D) + T[:3, 3]
+    torch.testing.assert_close(moved, torch.tensor(expected, dtype=D))
+
+
+def test_a_value_of_the_wrong_size_is_refused():
+    with pytest.raises(ValueError, match="takes 3 values"):
+        joint_motion(joint("spherical"), 0.1)
+    with pytest.raises(ValueError, match="takes 1 values"):
+        joint_motion(joint("revolute"), [0.1])
+
+
+def test_observed_values_give_the_observed_motions(bundle):
+    observed = observed_motions(bundle, 1)
+    for name, T in configured_motions(bundle, observed_values(bundle, 1)).items():
+        torch.testing.assert_close(T, observed[name])
+
+
+def test_a_childs_axis_turns_with_its_parent(bundle):
+    T = configured_motions(bundle, {"hinge": math.pi / 2, "slide": 1.0})["latch"]
+    # The latch at (2, 0, 0) slides to (3, 0, 0), and the door's quarter turn about (1, 0, 0) brings that to (1, 2, 0).
+    moved = T[:3, :3] @ torch.tensor([2.0, 0, 0], dtype=D) + T[:3, 3]
+    torch.testing.assert_close(moved, torch.tensor([1.0, 2.0, 0.0], dtype=D))
+
+
+def test_no_values_give_state_0(bundle):
+    splat = posed_splat(bundle, {})
+    torch.testing.assert_close(splat.means, torch.cat([part.splat.means for part in bundle.parts]))
+    assert splat.sh.shape == (18, 4, 3)
+
+
+def test_a_part_that_hangs_on_nothing_stays_with_the_root(bundle):
+    bundle.joints = [joint for joint in bundle.joints if joint.name != "slide"]
+    assert torch.equal(configured_motions(bundle, {"hinge": 1.0})["latch"], torch.eye(4, dtype=D))
+
+
+def test_an_unknown_joint_is_refused(bundle):
+    with pytest.raises(KeyError, match="closure"):
+        posed_splat(bundle, {"closure": 0.0})
+
+
+def test_features_tell_the_parts_apart(bundle):
+    features = part_features(bundle)
+    assert features.shape == (18, 3)
+    assert features.argmax(-1).tolist() == [0] * 5 + [1] * 6 + [2] * 7
+    assert len(moved_splat(bundle, observed_motions(bundle, 1))) == 18

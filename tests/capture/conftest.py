@@ -1,0 +1,108 @@
+"""A capture of a few pixels, in any of the three layouts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+SIZE = 16
+STATES, FRAMES = 2, 8
+
+
+def looking_at_origin(angle: float, distance: float = 4.0) -> np.ndarray:
+    """An OpenGL camera-to-world pose on a ring, a little above the origin that it looks at."""
+    centre = distance * np.array([np.cos(angle), np.sin(angle), 0.3])
+    back = centre / np.linalg.norm(centre)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3] = np.stack([right, np.cross(back, right), back, centre], axis=1)
+    return T
+
+
+def pose(i: int) -> list[list[float]]:
+    return looking_at_origin(2 * np.pi * i / FRAMES).tolist()
+
+
+def write_images(folder: Path, name: str, labels: str) -> None:
+    """A square object of two halves, part 1 left and part 2 right, in an RGBA image."""
+    part = np.zeros((SIZE, SIZE), np.uint8)
+    part[4:12, 4:8], part[4:12, 8:12] = 1, 2
+    image = np.zeros((SIZE, SIZE, 4), np.uint8)
+    image[..., 2], image[..., 1] = 100 * part, 50
+    image[..., 3] = np.where(part > 0, 255, 0)
+    for file, pixels in ((folder / name, image), (folder / labels, part)):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(file), pixels)
+
+
+def intrinsics() -> dict[str, Any]:
+    return {"w": SIZE, "h": SIZE, "fl_x": 20.0, "fl_y": 20.0, "cx": SIZE / 2, "cy": SIZE / 2, "camera_model": "OPENCV"}
+
+
+def entry(i: int, prefix: str = "") -> dict[str, Any]:
+    name = f"{prefix}images/{i:04d}.png"
+    return {"file_path": name, "semantics_path": f"{prefix}labels/{i:04d}.png", "transform_matrix": pose(i)}
+
+
+def write_state(folder: Path, **extra: Any) -> None:
+    """A state folder with six training and two test frames; `extra` goes into its transforms.json."""
+    entries = [entry(i) for i in range(FRAMES)]
+    for e in entries:
+        write_images(folder, e["file_path"], e["semantics_path"])
+    names = [e["file_path"] for e in entries]
+    splits = {"train_filenames": names[:6], "val_filenames": names[6:], "test_filenames": names[6:]}
+    meta = {**intrinsics(), "semantic_classes": ["background", "base", "door"], **splits, "frames": entries, **extra}
+    (folder / "transforms.json").write_text(json.dumps(meta))
+
+
+@pytest.fixture
+def capture_folder(tmp_path: Path) -> Path:
+    """A sound capture of two state folders."""
+    path = tmp_path / "capture"
+    for k in range(STATES):
+        write_state(path / f"state_{k:02d}")
+    return path
+
+
+@pytest.fixture
+def single_file_folder(tmp_path: Path) -> Path:
+    """A sound capture of one transforms.json with states, and no lists of splits."""
+    path = tmp_path / "single"
+    frames = [{**entry(i, f"s{k}/"), "state": k} for k in range(STATES) for i in range(FRAMES)]
+    for e in frames:
+        write_images(path, e["file_path"], e["semantics_path"])
+    (path / "transforms.json").write_text(json.dumps({**intrinsics(), "frames": frames}))
+    return path
+
+
+@pytest.fixture
+def paris_folder(tmp_path: Path) -> Path:
+    """A sound capture in the layout of PARIS."""
+    path = tmp_path / "paris"
+    K = [[20.0, 0.0, SIZE / 2], [0.0, 20.0, SIZE / 2], [0.0, 0.0, 1.0]]
+    for state in ("start", "end"):
+        for split, numbers in (("train", range(5)), ("val", range(5, 6)), ("test", range(6, 8))):
+            for i in numbers:
+                write_images(path / state, f"{split}/{i:04d}.png", f"{split}_semantics/{i:04d}.png")
+            cameras = {"K": K, **{f"{i:04d}": pose(i) for i in numbers}}
+            (path / state / f"camera_{split}.json").write_text(json.dumps(cameras))
+    return path
+
+
+@pytest.fixture
+def edit() -> Callable[[Path, Callable[[dict[str, Any]], Any]], None]:
+    """Changes a JSON file in place by a function of its value."""
+
+    def apply(file: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+        meta = json.loads(file.read_text())
+        change(meta)
+        file.write_text(json.dumps(meta))
+
+    return apply

@@ -1,0 +1,206 @@
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from splatart_ns.capture.capture import Camera
+from splatart_ns.capture.images import (
+    downscale,
+    downscale_labels,
+    image_size,
+    read_depth,
+    read_image,
+    read_labels,
+    read_mask,
+    read_sized,
+    undistort,
+    undistort_labels,
+    undistorted_camera,
+)
+from splatart_ns.errors import InputError
+
+RNG = np.random.default_rng(0)
+DISTORTED = Camera(50.0, 52.0, 31.0, 25.0, 64, 48, (-0.25, 0.08, 0.01, 0.0, 0.002, -0.001))
+
+
+def write(path, pixels):
+    assert cv2.imwrite(str(path), pixels)
+    return path
+
+
+def test_channels_come_in_rgb_order(tmp_path):
+    blue_green_red_alpha = np.zeros((2, 3, 4), np.uint8) + np.array([1, 2, 3, 4], np.uint8)
+    rgba = read_image(write(tmp_path / "a.png", blue_green_red_alpha))
+    assert rgba.shape == (2, 3, 4) and rgba[0, 0].tolist() == [3, 2, 1, 4]
+    rgb = read_image(write(tmp_path / "b.png", blue_green_red_alpha[..., :3]))
+    assert rgb.shape == (2, 3, 3) and rgb[0, 0].tolist() == [3, 2, 1]
+
+
+def test_sixteen_bit_and_grey_images_become_eight_bit_rgb(tmp_path):
+    deep = np.array([[0, 65535, 257 * 100, 257 * 100 + 128]], np.uint16)
+    assert read_image(write(tmp_path / "a.png", deep))[0, :, 0].tolist() == [0, 255, 100, 100]
+    grey = read_image(write(tmp_path / "b.png", np.full((2, 2), 7, np.uint8)))
+    assert grey.shape == (2, 2, 3) and (grey == 7).all()
+
+
+def test_jpeg_is_read(tmp_path):
+    image = read_image(write(tmp_path / "a.jpg", np.full((16, 16, 3), (200, 100, 50), np.uint8)))
+    assert np.abs(image.astype(int) - [50, 100, 200]).max() < 4
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("keep", [0, 3, 30, 0.5, -1])
+def test_a_cut_off_image_is_an_input_error(tmp_path, suffix, keep):
+    path = write(tmp_path / f"a{suffix}", RNG.integers(0, 255, (32, 32, 3), dtype=np.uint8))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(keep * len(data)) if 0 < keep < 1 else keep])
+    with pytest.raises(InputError, match=rf"a\{suffix}"):
+        read_image(path)
+
+
+def test_a_missing_file_a_folder_and_a_stranger_are_input_errors(tmp_path):
+    (tmp_path / "text.png").write_text("no image")
+    for name in ("nothing.png", ".", "text.png"):
+        for reader in (read_image, read_labels, read_mask, read_depth, image_size):
+            with pytest.raises(InputError):
+                reader(tmp_path / name)
+
+
+def test_labels_of_eight_and_sixteen_bits_are_the_same(tmp_path):
+    ids = np.array([[0, 1, 254, 255]], np.uint8)
+    for dtype in (np.uint8, np.uint16):
+        labels = read_labels(write(tmp_path / "a.png", ids.astype(dtype)))
+        assert labels.dtype == np.uint8 and labels.tolist() == ids.tolist()
+
+
+def test_labels_above_254_are_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="300"):
+        read_labels(write(tmp_path / "a.png", np.array([[0, 300]], np.uint16)))
+
+
+def test_coloured_palette_lossy_and_one_bit_labels_are_input_errors(tmp_path):
+    ids = np.array([[0, 1], [2, 3]], np.uint8)
+    colour = write(tmp_path / "colour.png", np.repeat(ids[..., None], 3, axis=2))
+    palette = Image.fromarray(ids, mode="P")
+    palette.putpalette(list(range(256)) * 3)
+    palette.save(tmp_path / "palette.png")
+    Image.fromarray(ids > 0).save(tmp_path / "bits.png")
+    jpeg = write(tmp_path / "lossy.jpg", ids)
+    for path, word in ((colour, "RGB"), (tmp_path / "palette.png", "palette"), (tmp_path / "bits.png", "1-bit")):
+        with pytest.raises(InputError, match=word):
+            read_labels(path)
+    with pytest.raises(InputError, match="not a PNG"):
+        read_labels(jpeg)
+
+
+def test_masks_of_zero_and_one_are_stretched(tmp_path):
+    binary = np.array([[0, 1]], np.uint8)
+    assert read_mask(write(tmp_path / "a.png", binary)).tolist() == [[0, 255]]
+    assert read_mask(write(tmp_path / "b.png", np.array([[0, 90]], np.uint8))).tolist() == [[0, 90]]
+    assert read_mask(write(tmp_path / "c.png", np.repeat(binary[..., None] * 255, 3, axis=2))).tolist() == [[0, 255]]
+
+
+def test_a_coloured_mask_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="one grey channel"):
+        read_mask(write(tmp_path / "a.png", np.array([[[0, 0, 200]]], np.uint8)))
+
+
+def test_depth_is_in_millimetres_in_both_forms(tmp_path):
+    counts = np.array([[0, 1500]], np.uint16)
+    np.save(tmp_path / "b.npy", np.array([[np.nan, 1500.0]]))
+    for path in (write(tmp_path / "a.png", counts), tmp_path / "b.npy"):
+        depth = read_depth(path)
+        assert depth.dtype == np.float32
+        np.testing.assert_allclose(depth, [[0, 1.5]])
+
+
+def test_a_pickled_depth_is_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([[{}]], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError):
+        read_depth(tmp_path / "a.npy")
+
+
+def test_image_size_is_width_and_height(tmp_path):
+    assert image_size(write(tmp_path / "a.png", np.zeros((3, 5), np.uint8))) == (5, 3)
+    assert image_size(write(tmp_path / "a.jpg", np.zeros((3, 5), np.uint8))) == (5, 3)
+
+
+def test_a_file_of_another_size_is_an_input_error(tmp_path):
+    path = write(tmp_path / "a.png", np.zeros((3, 5), np.uint8))
+    assert read_sized(path, read_mask, Camera(5, 5, 2, 1, 5, 3)).shape == (3, 5)
+    with pytest.raises(InputError, match="5x3 pixels, but its camera is 3x5"):
+        read_sized(path, read_mask, Camera(5, 5, 2, 1, 3, 5))
+
+
+def test_undistortion_gives_the_image_and_camera_of_opencvs_undistort():
+    """The steps of nerfstudio's FullImageDatamanager, with pixel centres at integers as OpenCV has them."""
+    c = DISTORTED
+    image = cv2.GaussianBlur(RNG.integers(0, 255, (c.height, c.width, 3), dtype=np.uint8), (0, 0), 2)
+    K = np.array([[c.fx, 0, c.cx - 0.5], [0, c.fy, c.cy - 0.5], [0, 0, 1]])
+    k1, k2, k3, _, p1, p2 = c.distortion
+    distortion = np.array([k1, k2, p1, p2, k3])
+    new_K, (x, y, w, h) = cv2.getOptimalNewCameraMatrix(K, distortion, (c.width, c.height), 0)
+    expected = cv2.undistort(image, K, distortion, None, new_K)[y : y + h, x : x + w]
+    made = undistort(image, c)
+    assert made.shape == expected.shape
+    assert np.abs(made.astype(int) - expected).max() <= 2
+    new = undistorted_camera(c)
+    assert (new.width, new.height, new.distorted) == (w, h, False)
+    np.testing.assert_allclose(new.K, new_K + [[0, 0, 0.5 - x], [0, 0, 0.5 - y], [0, 0, 0]])
+
+
+def test_a_point_lies_where_the_undistorted_camera_projects_it():
+    c = DISTORTED
+    ray = np.array([0.2, -0.15, 1.0])
+    k1, k2, k3, _, p1, p2 = c.distortion
+    (x, y), _ = (
+        cv2.projectPoints(ray[None], np.zeros(3), np.zeros(3), c.K, np.array([k1, k2, p1, p2, k3]))[0].reshape(2),
+        None,
+    )
+    v, u = np.mgrid[: c.height, : c.width] + 0.5
+    image = (255 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / 8)).astype(np.uint8)
+    made = undistort(image, c).astype(float)
+    new = undistorted_camera(c)
+    v, u = np.mgrid[: new.height, : new.width] + 0.5
+    found = np.array([(u * made).sum(), (v * made).sum()]) / made.sum()
+    expected = (new.K @ ray)[:2]
+    np.testing.assert_allclose(found, expected, atol=0.15)
+
+
+def test_undistortion_never_mixes_label_ids():
+    labels = RNG.choice(np.array([1, 200, 255], np.uint8), (DISTORTED.height, DISTORTED.width))
+    made = undistort_labels(labels, DISTORTED)
+    new = undistorted_camera(DISTORTED)
+    assert made.shape == (new.height, new.width)
+    assert set(np.unique(made)) == {1, 200, 255}
+
+
+def test_without_distortion_nothing_changes():
+    camera = Camera(50.0, 50.0, 8.0, 8.0, 16, 16)
+    image = RNG.integers(0, 255, (16, 16, 4), dtype=np.uint8)
+    assert undistorted_camera(camera) is camera
+    assert undistort(image, camera) is image
+    assert undistort_labels(image[..., 0], camera).tolist() == image[..., 0].tolist()
+
+
+def test_downscaling_means_colours_and_cuts_the_remainder():
+    image = np.zeros((5, 5, 3), np.uint8)
+    image[:2, :2] = [[[0], [100]], [[100], [200]]]
+    small = downscale(image, 2)
+    assert small.shape == (2, 2, 3)
+    assert small[0, 0].tolist() == [100, 100, 100] and small[1, 1].tolist() == [0, 0, 0]
+
+
+def test_what_is_transparent_does_not_bleed_into_a_smaller_image():
+    image = np.zeros((2, 2, 4), np.uint8)
+    image[0, 0] = [200, 100, 50, 255]
+    image[1, 1] = [255, 255, 255, 0]
+    assert downscale(image, 2)[0, 0].tolist() == [200, 100, 50, 64]
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 4])
+def test_downscaled_labels_are_the_middle_of_their_block(factor):
+    row = np.arange(12, dtype=np.uint8)
+    small = downscale_labels(np.tile(row, (12, 1)), factor)
+    assert small.shape == (12 // factor, 12 // factor)
+    assert small[0].tolist() == (np.arange(12 // factor) * factor + factor // 2).tolist()

@@ -1,0 +1,107 @@
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from splatart_ns.geometry.se3 import se3_exp
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics, pose_splat
+from splatart_ns.stages.joint import JointFit
+
+
+def joint(parent, child, kind, axis, origin, limits=(0.0, 1.0), pitch=0.0):
+    axis = torch.tensor(axis, dtype=torch.float64)
+    return Joint(
+        parent,
+        child,
+        JointFit(kind, axis, torch.tensor(origin, dtype=torch.float64), pitch, torch.tensor([0.0, *limits]), 0.0),
+    )
+
+
+def tree() -> KinematicTree:
+    """Base 4, arm 2 turning on it, tool 9 sliding on the arm, a lid 3 fixed to the tool, a cap 5 screwed on; 8 loose."""
+    joints = [
+        joint(4, 2, "revolute", [0, 0, 1], [1, 0, 0], (-1, 1)),
+        joint(2, 9, "prismatic", [0, 1, 0], [0, 0, 0], (0, 0.5)),
+        joint(9, 3, "fixed", [0, 0, 1], [0, 0, 0]),
+        joint(4, 5, "screw", [1, 0, 0], [0, 0, 2], (0, 3), pitch=0.2),
+    ]
+    return KinematicTree([2, 3, 4, 5, 8, 9], 4, joints, unattached={8: "loose"})
+
+
+def turn(rotvec, origin):
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(rotvec).as_matrix()
+    T[:3, 3] = origin - T[:3, :3] @ origin
+    return T
+
+
+def shift(t):
+    T = np.eye(4)
+    T[:3, 3] = t
+    return T
+
+
+def test_motions_are_products_along_the_chain():
+    q = torch.tensor([0.7, 0.3, 1.5], dtype=torch.float64)
+    T = forward_kinematics(tree(), q).numpy()
+    arm = turn([0, 0, 0.7], np.array([1.0, 0, 0]))
+    tool = arm @ shift([0, 0.3, 0])
+    cap = turn([1.5, 0, 0], np.array([0, 0, 2.0])) @ shift([0.3, 0, 0])
+    for found, expected in zip(T, [arm, tool, np.eye(4), cap, np.eye(4), tool], strict=True):
+        assert np.allclose(found, expected, atol=1e-14)
+
+
+def test_batches_root_motion_and_names():
+    q = torch.rand(2, 5, 3, dtype=torch.float64)
+    T = forward_kinematics(tree(), q)
+    assert T.shape == (2, 5, 6, 4, 4)
+    assert torch.allclose(T[1, 3], forward_kinematics(tree(), q[1, 3]))
+    root = se3_exp(torch.tensor([1.0, 2, 3, 0.1, 0.2, 0.3], dtype=torch.float64))
+    assert torch.allclose(forward_kinematics(tree(), q, root_motion=root), root @ T)
+    by_name = forward_kinematics(tree(), {"joint_2_9": 0.25})
+    assert torch.allclose(by_name, forward_kinematics(tree(), torch.tensor([0, 0.25, 0], dtype=torch.float64)))
+    with pytest.raises(KeyError, match="joint_9_9"):
+        forward_kinematics(tree(), {"joint_9_9": 0.25})
+    with pytest.raises(ValueError, match="4 values for 3"):
+        forward_kinematics(tree(), torch.zeros(4))
+
+
+def test_values_are_clamped_on_request():
+    q = torch.tensor([-3.0, 0.8, 9.0])
+    limit = torch.tensor([-1.0, 0.5, 3.0])
+    assert torch.allclose(forward_kinematics(tree(), q, clamp=True), forward_kinematics(tree(), limit))
+    assert not torch.allclose(forward_kinematics(tree(), q), forward_kinematics(tree(), limit))
+
+
+def test_gradients_reach_values_and_root_also_at_zero():
+    q = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    root = torch.eye(4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda q, root: forward_kinematics(tree(), q, root_motion=root), (q, root))
+
+
+def test_observed_configurations_come_from_the_fits():
+    assert tree().observed().tolist() == [[0, 0, 0], [-1, 0, 0], [1, 0.5, 3]]
+
+
+def test_a_tree_without_movable_joints_stays():
+    still = KinematicTree([1, 2], 1, [joint(1, 2, "fixed", [0, 0, 1], [0, 0, 0])])
+    T = forward_kinematics(still, torch.zeros(7, 0), clamp=True)
+    assert torch.equal(T, torch.eye(4).expand(7, 2, 4, 4))
+    assert still.observed().shape == (3, 0)
+
+
+def test_posing_moves_every_part_by_its_own_motion():
+    def splat(x):
+        return Splat(
+            torch.tensor([[x, 0.0, 0.0]]),
+            torch.tensor([[1.0, 0, 0, 0]]),
+            torch.zeros(1, 3),
+            torch.zeros(1),
+            torch.zeros(1, 1, 3),
+        )
+
+    motions = {1: torch.eye(4), 2: torch.tensor(turn([0, 0, np.pi / 2], np.zeros(3)))}
+    posed = pose_splat({2: splat(1.0), 1: splat(5.0)}, motions)
+    assert torch.allclose(posed.means, torch.tensor([[0.0, 1, 0], [5, 0, 0]]), atol=1e-6)
+    assert torch.allclose(posed.quats[0].abs(), torch.tensor([0.5**0.5, 0, 0, 0.5**0.5]), atol=1e-6)

@@ -1,0 +1,52 @@
+import pytest
+import torch
+
+from splatart_ns.geometry.se3 import from_rotation_translation
+from splatart_ns.stages.contact import find_contacts
+from splatart_ns.stages.joint import joint_motion
+
+
+def box(low, high, count=1500, seed=0):
+    """Points in a box."""
+    x = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    low, high = torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
+    return low + x * (high - low)
+
+
+def slide(*steps):
+    return from_rotation_translation(torch.eye(3, dtype=torch.float64), torch.tensor(steps, dtype=torch.float64))
+
+
+def test_gap_is_the_largest_over_the_states():
+    points = {1: box((0, 0, 0), (1, 1, 1)), 2: box((1, 0, 0), (2, 1, 1), seed=1)}
+    still = slide((0, 0, 0), (0, 0, 0))
+    assert find_contacts(points, {1: still, 2: still})[1, 2].gap < 0.05
+    apart = slide((0, 0, 0), (0.5, 0, 0))
+    assert find_contacts(points, {1: still, 2: apart})[1, 2].gap == pytest.approx(0.5, abs=0.06)
+    # Moving together changes nothing.
+    assert find_contacts(points, {1: apart, 2: apart})[1, 2].gap < 0.05
+
+
+def test_a_small_part_touches_a_large_one():
+    points = {1: box((0, 0, 0), (1, 1, 1), 2000), 7: box((1, 0.5, 0.5), (1.1, 0.52, 0.52), 300, seed=1)}
+    still = slide((0, 0, 0), (0, 0, 0))
+    assert find_contacts(points, {1: still, 7: still})[1, 7].gap < 0.05
+
+
+def test_what_stays_in_touch_lies_at_the_hinge():
+    points = {1: box((0, 0, 0), (1, 0.05, 1)), 2: box((1, 0, 0), (2, 0.05, 1), seed=1)}
+    axis, hinge = torch.tensor([0, 0, 1.0]).double(), torch.tensor([1, 0, 0.0]).double()
+    motions = {
+        1: slide((0, 0, 0), (0, 0, 0)),
+        2: joint_motion("revolute", axis, hinge, 0.0, torch.tensor([0, 1.3]).double()),
+    }
+    contact = find_contacts(points, motions)[1, 2]
+    assert contact.distance_to_axis(axis, hinge) < 0.06
+    assert contact.distance_to_axis(axis, hinge + torch.tensor([0.7, 0, 0]).double()) > 0.6
+
+
+def test_large_parts_are_thinned():
+    points = {1: box((0, 0, 0), (1, 1, 1), 9000), 2: box((1, 0, 0), (2, 1, 1), 9000, seed=1)}
+    still = slide((0, 0, 0), (0, 0, 0))
+    contact = find_contacts(points, {1: still, 2: still})[1, 2]
+    assert len(contact.points) == 36  # 1 % of 9000 / 5 on either side
