@@ -63,7 +63,9 @@ def check(capture: Annotated[Path, tyro.conf.Positional]) -> None:
 
     problems = check_capture(capture)
     for problem in problems:
-        CONSOLE.print(f"[bold]{problem.severity}[/bold] {problem.file}: {problem.message} {problem.mend}", soft_wrap=True)
+        CONSOLE.print(
+            f"[bold]{problem.severity}[/bold] {problem.file}: {problem.message} {problem.mend}", soft_wrap=True
+        )
     errors = sum(problem.severity == "error" for problem in problems)
     CONSOLE.print(f"{errors} errors, {len(problems) - errors} warnings")
     if errors:

@@ -33,8 +33,9 @@ def render_frames(
     viewpoint: Viewpoint,
     output: Output = "rgb",
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    device: torch.device | str = "cpu",
 ) -> Iterator[np.ndarray]:
-    """Render one frame per configuration, uint8 [H, W, 3] RGB.
+    """Render one frame per configuration on `device`, uint8 [H, W, 3] RGB.
 
     `background` is in 0..1. Depth is shown in colours, red near and blue far, over the depths that the object can have;
     parts have the colours of `part_colours`; accumulation is grey.
@@ -43,15 +44,16 @@ def render_frames(
     # The renderer's near plane is a fixed length, so the object is brought to the size of one unit.
     normalization = Normalization(centre, 1 / radius)
     T = torch.from_numpy(normalization.camera_to_normal(viewpoint.T_world_camera))
-    viewmat = viewmat_from_opengl(T).float()[None]
+    viewmat = viewmat_from_opengl(T).float()[None].to(device)
     camera = viewpoint.camera
-    features = part_features(bundle) @ part_colours(bundle)
+    K = torch.from_numpy(camera.K).float()[None].to(device)
+    features = (part_features(bundle) @ part_colours(bundle)).to(device)
     distance = float(T[:3, 3].norm())
     for configuration in configurations:
         rendering = render(
-            normalized(posed_splat(bundle, configuration), normalization),
+            normalized(posed_splat(bundle, configuration), normalization).to(device),
             viewmat,
-            torch.from_numpy(camera.K).float()[None],
+            K,
             camera.width,
             camera.height,
             features=features if output == "parts" else None,
@@ -63,16 +65,16 @@ def render_frames(
 
 def _image(rendering: Rendering, output: Output, background: Tensor, depths: tuple[float, float]) -> Tensor:
     """What is shown [H, W, 3] in 0..1."""
-    accumulation = rendering.accumulation[0]
+    accumulation = rendering.accumulation[0].cpu()
     if output == "accumulation":
         return accumulation.expand(-1, -1, 3)
     if output == "depth":
         near, far = depths
-        share = ((far - rendering.depth[0, ..., 0]) / (far - near)).clamp(0, 1)
+        share = ((far - rendering.depth[0, ..., 0].cpu()) / (far - near)).clamp(0, 1)
         colours = cv2.applyColorMap((255 * share).round().byte().numpy(), cv2.COLORMAP_TURBO)[..., ::-1]
         image = accumulation * torch.from_numpy(colours.copy()) / 255
     else:
-        image = rendering.rgb[0] if output == "rgb" else rendering.features[0]
+        image = (rendering.rgb if output == "rgb" else rendering.features)[0].cpu()
     return image + (1 - accumulation) * background
 
 

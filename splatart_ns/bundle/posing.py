@@ -41,7 +41,7 @@ def joint_motion(joint: Joint, value: JointValue) -> Tensor:
 def configured_motions(bundle: Bundle, q: Mapping[str, JointValue]) -> dict[str, Tensor]:
     """T[part] [4, 4] float64, canonical frame to the configuration `q` (joint name to value; the others are 0).
 
-    The root stays where it is at state 0, and so do parts that hang on nothing. A name that is no tree joint raises KeyError.
+    The root stays where it is at state 0, and so do parts that hang on nothing. Raises KeyError for an unknown name.
     """
     if unknown := set(q) - {joint.name for joint in bundle.tree_joints}:
         raise KeyError(f"no tree joint is called {', '.join(sorted(unknown))}")

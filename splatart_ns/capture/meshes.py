@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from splatart_ns.capture.surface import WHITE, Surface, join
+from splatart_ns.capture.surface import Surface, join
 from splatart_ns.errors import InputError
 
 _log = logging.getLogger(__name__)
@@ -122,15 +122,14 @@ def _material(material: object) -> tuple[np.ndarray | None, np.ndarray | None]:
             tint = tint / 255.0
     else:
         image = getattr(material, "image", None)
-        # An OBJ without material file gets trimesh's own material, which has no name and says nothing of the object.
-        named = getattr(material, "kwargs", None) or getattr(material, "name", None)
-        tint = np.asarray(material.diffuse)[:3] / 255.0 if named else None
-        # Kd beside a map_Kd is seldom meant: exporters leave it at black, 0.8 or white.
-        tint = None if image is not None else tint
+        # Where an OBJ has no material, trimesh makes one up; a picture that came from a file has a format.
+        image = None if image is None or image.format is None else image
+        told = image is None and bool(getattr(material, "kwargs", None))
+        # Kd beside a map_Kd is left out: exporters leave it at black, 0.8 or white as they like.
+        tint = np.asarray(material.diffuse)[:3] / 255.0 if told else None
     if image is None:
         return tint, None
-    pixels = np.asarray(_opaque(image))
-    return tint, (pixels if pixels.size else WHITE)
+    return tint, np.asarray(_opaque(image))
 
 
 def _opaque(image: Image.Image) -> Image.Image:

@@ -19,14 +19,11 @@ import trimesh
 
 from splatart_ns.capture.capture import Camera
 from splatart_ns.capture.ray_caster import Light, RayCaster
-from splatart_ns.capture.robot import Joint, Part, Robot, read_urdf
-from splatart_ns.capture.surface import Surface
+from splatart_ns.capture.robot import Joint, Robot, read_urdf
+from splatart_ns.capture.scene import Scene, camera_poses, ground_truth
 from splatart_ns.errors import InputError
 
 POINTS_PER_PART = 10_000
-_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
-_MARGIN = 1.05
-"""Room about the object's bounding sphere in the image."""
 _TURN = 1.75
 """Radian: joints that turn further than this are moved within a window of it, so that states have views in common."""
 
@@ -58,7 +55,7 @@ class SynthesisOptions:
     light: Light = field(default_factory=Light)
     """What lights the object."""
     length_unit: str = "metre"
-    """The URDF's unit of length, as it is noted in the ground truth."""
+    """The URDF's unit of length, as the capture notes it."""
     seed: int = 0
     """The same seed writes the same bytes."""
 
@@ -86,13 +83,14 @@ def synthesize(urdf: Path, output_dir: Path, options: SynthesisOptions | None = 
     robot = read_urdf(Path(urdf))
     frozen = _frozen(robot, options)
     configurations = _configurations(robot, frozen, options)
-    scene = _Scene.of(robot, frozen, configurations)
+    scene = Scene.of(robot, frozen, configurations)
     with _new_folder(output_dir) as folder:
         for k, values in enumerate(configurations):
             _write_state(folder / f"state_{k:02d}", scene, values, options, options.train_views, k)
         _write_state(folder / "eval" / "novel_00", scene, scene.novel, options, 0, len(configurations))
         _write_points(folder / "ground_truth_points", scene, options.seed)
-        text = json.dumps(_ground_truth(scene, options), indent=1)
+        truth = ground_truth(scene, options.fov_degrees, options.resolution, options.length_unit, POINTS_PER_PART)
+        text = json.dumps(truth, indent=1)
         (folder / "ground_truth.json").write_text(text + "\n", encoding="utf-8")
     return output_dir
 
@@ -177,81 +175,8 @@ def _spread_values(joint: Joint, robot: Robot, count: int, rng: np.random.Genera
     return np.round(low + (high - low) * places, 4).clip(low, high)
 
 
-@dataclass(frozen=True)
-class _Scene:
-    """What is rendered, and where it is in each state."""
-
-    robot: Robot
-    frozen: dict[str, float]
-    parts: tuple[Part, ...]
-    ids: dict[str, int]
-    """Part name to id, of the parts that have a shape."""
-    surfaces: dict[int, Surface]
-    """Part id to the part's surface in its own frame."""
-    configurations: list[dict[str, float]]
-    novel: dict[str, float]
-    centre: np.ndarray
-    """[3]: of the box about all states."""
-    radius: float
-    """Of the sphere about the centre that holds all states."""
-
-    @staticmethod
-    def of(robot: Robot, frozen: dict[str, float], configurations: list[dict[str, float]]) -> _Scene:
-        parts = robot.parts(frozen)
-        shaped = [p for p in parts if p.has_geometry]
-        if not shaped:
-            raise InputError(f"{robot.path}: no link has a <visual>; there is nothing to render.")
-        if len(shaped) > 254:
-            raise InputError(f"{robot.path}: has {len(shaped)} parts; labels have room for 254, freeze some joints.")
-        ids = {p.name: i for i, p in enumerate(shaped, start=1)}
-        surfaces = {ids[p.name]: robot.surface(p, configurations[0]) for p in shaped}
-        first, second = configurations[:2]
-        novel = robot.complete({name: 0.5 * (first[name] + second[name]) for name in first})
-
-        points = []
-        for values in (*configurations, novel):
-            poses = robot.link_poses(values)
-            for part in shaped:
-                T, corners = poses[part.frame_link], surfaces[ids[part.name]].triangles.reshape(-1, 3)
-                points.append(corners @ T[:3, :3].T + T[:3, 3])
-        points = np.concatenate(points)
-        centre = np.round(0.5 * (points.min(axis=0) + points.max(axis=0)), 9)
-        radius = float(np.linalg.norm(points - centre, axis=-1).max())
-        return _Scene(robot, frozen, parts, ids, surfaces, configurations, novel, centre, radius)
-
-    def part_poses(self, values: Mapping[str, float]) -> dict[str, np.ndarray]:
-        """T_world_part [4, 4] by part name."""
-        poses = self.robot.link_poses(values)
-        return {p.name: poses[p.frame_link] for p in self.parts}
-
-    def placed(self, values: Mapping[str, float]) -> dict[int, Surface]:
-        """Part id to surface in the world."""
-        poses = self.part_poses(values)
-        return {i: self.surfaces[i].moved(poses[name]) for name, i in self.ids.items()}
-
-    def camera_distance(self, fov_degrees: float) -> float:
-        """From the centre to a camera that sees all of the bounding sphere."""
-        return _MARGIN * self.radius / math.sin(math.radians(0.5 * fov_degrees))
-
-
-def camera_poses(count: int, centre: np.ndarray, distance: float, views: str, rng: np.random.Generator) -> np.ndarray:
-    """Cameras [count, 4, 4] (OpenGL camera-to-world) that look at the centre, z up: a jittered Fibonacci lattice."""
-    place = (np.arange(count) + rng.uniform(0.25, 0.75, count)) / max(count, 1)
-    z = 1.0 - (place if views == "hemisphere" else 2.0 * place)
-    spacing = math.sqrt(4.0 * math.pi / max(count, 1))
-    azimuth = np.arange(count) * _GOLDEN_ANGLE + rng.uniform(0.0, 2.0 * math.pi)
-    azimuth += rng.uniform(-0.15, 0.15, count) * spacing
-    across = np.sqrt(1.0 - z**2)
-    back = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=-1)
-    right = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(count)], axis=-1)
-    T = np.tile(np.eye(4), (count, 1, 1))
-    T[:, :3, 0], T[:, :3, 1], T[:, :3, 2] = right, np.cross(back, right), back
-    T[:, :3, 3] = centre + distance * back
-    return np.round(T, 9)
-
-
 def _write_state(
-    folder: Path, scene: _Scene, values: Mapping[str, float], options: SynthesisOptions, train_views: int, index: int
+    folder: Path, scene: Scene, values: Mapping[str, float], options: SynthesisOptions, train_views: int, index: int
 ) -> None:
     """Images, labels, silhouettes and transforms.json of one configuration."""
     size = options.resolution
@@ -288,6 +213,7 @@ def _write_state(
         "cx": 0.5 * size,
         "cy": 0.5 * size,
         **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+        "length_unit": options.length_unit,
         "semantic_classes": ["background", *scene.ids],
         "train_filenames": train,
         "val_filenames": test,
@@ -302,112 +228,11 @@ def _write_png(path: Path, image: np.ndarray) -> None:
         raise InputError(f"{path}: the image cannot be written; check the space on the disk.")
 
 
-def _write_points(folder: Path, scene: _Scene, seed: int) -> None:
+def _write_points(folder: Path, scene: Scene, seed: int) -> None:
     folder.mkdir()
     for i, surface in scene.placed(scene.configurations[0]).items():
         points = surface.sample(POINTS_PER_PART, np.random.default_rng([seed, 2, i]))
         trimesh.PointCloud(points.astype(np.float32)).export(folder / f"part_{i}.ply")
-
-
-def _ground_truth(scene: _Scene, options: SynthesisOptions) -> dict:
-    """ground_truth.json, as data."""
-    robot, start = scene.robot, scene.part_poses(scene.configurations[0])
-    index = {p.name: i for i, p in enumerate(scene.parts)}
-    part_of = {link: p.name for p in scene.parts for link in p.links}
-    link_poses = robot.link_poses(scene.configurations[0])
-
-    def motion(values: Mapping[str, float]) -> dict[str, list]:
-        poses = scene.part_poses(values)
-        return {name: _rounded(poses[name] @ np.linalg.inv(start[name])) for name in poses}
-
-    joints = []
-    for joint in robot.movable:
-        if joint.name in scene.frozen:
-            continue
-        T_world_joint = link_poses[joint.parent] @ joint.T_parent_joint
-        parent, child = part_of[joint.parent], part_of[joint.child]
-        mimic = joint.mimic and {
-            "joint": joint.mimic.joint,
-            "multiplier": joint.mimic.multiplier,
-            "offset": joint.mimic.offset,
-        }
-        joints.append(
-            {
-                "name": joint.name,
-                "type": joint.type,
-                "parent": parent,
-                "child": child,
-                "parent_id": scene.ids.get(parent),
-                "child_id": scene.ids.get(child),
-                "parent_index": index[parent],
-                "child_index": index[child],
-                "axis": _rounded(T_world_joint[:3, :3] @ joint.axis),
-                "origin": _rounded(T_world_joint[:3, 3]),
-                "limits": joint.limits and list(joint.limits),
-                "mimic": mimic,
-                "values": [values[joint.name] for values in scene.configurations],
-            }
-        )
-
-    def moving(values: Mapping[str, float]) -> dict[str, float]:
-        return {name: v for name, v in values.items() if name not in scene.frozen}
-
-    return {
-        "format": "articulated-ground-truth-1",
-        "source": {"urdf": robot.path.name, "robot_name": robot.name, "frozen_joints": scene.frozen},
-        "units": {
-            "length": options.length_unit,
-            "angle": "radian",
-            "poses": "4x4, part frame to world frame",
-            "joint_axis_and_origin": "world frame, at state 0",
-        },
-        "world_frame": "frame of the URDF root link; z is up",
-        "segmentation": {"background": 0, "part_ids": {str(i): name for name, i in scene.ids.items()}},
-        "parts": [
-            {
-                "index": index[p.name],
-                "id": scene.ids.get(p.name),
-                "name": p.name,
-                "has_geometry": p.has_geometry,
-                "root": index[p.name] == 0,
-                "frame_link": p.frame_link,
-                "links": list(p.links),
-            }
-            for p in scene.parts
-        ],
-        "joints": joints,
-        "states": [
-            {
-                "index": k,
-                "folder": f"state_{k:02d}",
-                "joint_values": moving(values),
-                "part_poses": {name: _rounded(T) for name, T in scene.part_poses(values).items()},
-                "motion_from_state_0": motion(values),
-            }
-            for k, values in enumerate(scene.configurations)
-        ],
-        "cameras": {
-            "model": "pinhole",
-            "convention": "OpenGL camera-to-world (x right, y up, looks along -z); pixel centres at +0.5",
-            "look_at": scene.centre.tolist(),
-            "radius": scene.camera_distance(options.fov_degrees),
-            "fov_degrees": options.fov_degrees,
-            "resolution": options.resolution,
-            "object_bounding_radius": scene.radius,
-        },
-        "novel": [
-            {
-                "folder": "eval/novel_00",
-                "joint_values": moving(scene.novel),
-                "motion_from_state_0": motion(scene.novel),
-            }
-        ],
-        "points": f"ground_truth_points/part_<id>.ply: {POINTS_PER_PART} points a part, sampled by area, at state 0",
-    }
-
-
-def _rounded(values: np.ndarray) -> list:
-    return (np.round(values, 9) + 0.0).tolist()
 
 
 @contextmanager

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 import trimesh
@@ -41,11 +42,16 @@ class View:
     rgb: Tensor
     """uint8 [H, W, 3], straight: not multiplied by alpha."""
     alpha: Tensor | None = None
-    """uint8 [H, W], the object's silhouette."""
+    """uint8 [H, W], how much of each pixel the object covers."""
     labels: Tensor | None = None
     """uint8 [H, W]: 0 background, 1..P parts, 255 unlabelled."""
     mask: Tensor | None = None
     """bool [H, W], the pixels that count in the loss."""
+
+    def to(self, device: torch.device | str) -> View:
+        """The view with its tensors on a device."""
+        tensors = {f.name: v.to(device) for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
+        return replace(self, **tensors)
 
     def rgb_on(self, background: Tensor) -> Tensor:
         """The image in front of a background colour [3] in 0..1: float32 [H, W, 3] in 0..1."""
@@ -67,7 +73,8 @@ def load_views(capture: Capture, state: int | State, split: str = "train", downs
 
 
 def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) -> View:
-    """One view; the silhouette comes from the frame's object mask, else from the image's alpha, else it is None.
+    """One view. Its alpha is the image's where there is one, without what the frame's object mask leaves out; for an
+    opaque image it is the mask, and None when there is neither.
 
     Raises `InputError` for a file that cannot be used.
     """
@@ -81,10 +88,14 @@ def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) ->
 
     image = read(frame.image, read_image)
     alpha = labels = mask = None
-    if frame.object_mask is not None:
-        alpha = torch.from_numpy(read(frame.object_mask, read_mask))
-    elif image.shape[2] == 4:
+    if image.shape[2] == 4:
         alpha = torch.from_numpy(np.ascontiguousarray(image[..., 3]))
+    if frame.object_mask is not None:
+        silhouette = read(frame.object_mask, read_mask)
+        if alpha is None or bool((alpha == 255).all()):
+            alpha = torch.from_numpy(silhouette)
+        else:  # a mask is hard where the alpha is soft: leave the pixels along its edge to the alpha
+            alpha = torch.minimum(alpha, torch.from_numpy(cv2.dilate(silhouette, np.ones((3, 3), np.uint8))))
     if frame.labels is not None:
         ids = undistort_labels(read_sized(frame.labels, read_labels, distorted), distorted)
         labels = torch.from_numpy(downscale_labels(ids, downscale))

@@ -28,8 +28,8 @@ METRICS = "metrics.json"
 
 
 @torch.no_grad()
-def evaluate(bundle_folder: Path, capture_path: Path) -> dict[str, Any]:
-    """Score a bundle and write `metrics.json` into its folder; returns what the file holds.
+def evaluate(bundle_folder: Path, capture_path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Score a bundle and write `metrics.json` into its folder; returns what the file holds. Renders on `device`.
 
     A capture without `ground_truth.json` gives image metrics only. Raises InputError for unusable input.
     """
@@ -56,7 +56,7 @@ def evaluate(bundle_folder: Path, capture_path: Path) -> dict[str, Any]:
         notes.append("joints, structure, parts, geometry: the capture has no ground_truth.json")
     else:
         _score_model(metrics, notes, bundle, truth, len(capture.states), capture_path)
-    _score_images(metrics, notes, bundle, truth, capture, load_novel(capture_path))
+    _score_images(metrics, notes, bundle, truth, capture, load_novel(capture_path), device)
     report = bundle_folder / "report.json"
     if report.is_file():
         metrics["speed"] = read_record(report, "run `splatart fit` again").fields
@@ -99,11 +99,12 @@ def _score_images(
     truth: GroundTruth | None,
     capture: Capture,
     novel: Sequence[State],
+    device: torch.device | str,
 ) -> None:
     def score(state: State, motions: dict[str, torch.Tensor]) -> None:
         split = "test" if state.split("test") else "val"
         views = load_views(capture, state, split)
-        scores, why = image_scores(bundle, motions, views, capture)
+        scores, why = image_scores(bundle, motions, views, capture, device)
         metrics["images"][state.name] = scores
         notes.extend(f"images.{state.name}: {text}" for text in why)
 

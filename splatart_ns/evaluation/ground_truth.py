@@ -18,13 +18,16 @@ _TYPES = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prisma
 
 @dataclass(frozen=True)
 class TrueJoint:
-    """A joint; parts are given by label id, axis and origin are in the world at state 0."""
+    """A joint; axis and origin are in the world at state 0."""
 
     name: str
     type: str
     """"revolute", "prismatic" or "fixed"."""
-    parent: int
-    child: int
+    parent: int | None
+    """Label id; None for a part without geometry, which no image shows."""
+    child: int | None
+    parent_name: str
+    child_name: str
     axis: Tensor
     """Unit axis [3] float64."""
     origin: Tensor
@@ -51,7 +54,9 @@ class GroundTruth:
     """The truth about one capture; parts by label id, lengths in the capture's unit, float64."""
 
     parts: dict[int, str]
+    """The parts that have geometry."""
     root: int
+    """The root, or the first part with geometry where the root has none."""
     joints: list[TrueJoint]
     motions: dict[int, Tensor]
     """Motion of each part since state 0 [S, 4, 4], world frame."""
@@ -62,7 +67,7 @@ class GroundTruth:
     """The object's bounding radius."""
 
     def relative_motion(self, joint: TrueJoint) -> Tensor:
-        """The child's motion relative to its parent [S, 4, 4], canonical frame."""
+        """The child's motion relative to its parent [S, 4, 4], canonical frame; both have geometry."""
         return torch.linalg.solve(self.motions[joint.parent], self.motions[joint.child])
 
 
@@ -74,13 +79,11 @@ def load_ground_truth(capture: Path) -> GroundTruth | None:
     top = read_record(path, "check the capture's folder")
     if (form := top.text("format")) != FORMAT:
         top.fail("format", f"is '{form}'", f"this version reads '{FORMAT}'")
-    parts, roots = {}, []
-    for record in top.records("parts"):
-        if record.flag("has_geometry"):
-            parts[record.integer("id")] = record.text("name")
-            roots += [record.integer("id")] if record.flag("root") else []
-    if len(roots) != 1:
-        top.fail("parts", f"has {len(roots)} roots with geometry", "mark one part as the root")
+    shaped = [record for record in top.records("parts") if record.flag("has_geometry")]
+    parts = {record.integer("id"): record.text("name") for record in shaped}
+    if not parts:
+        top.fail("parts", "has none with geometry", "give the truth about something that can be seen")
+    root = next((record for record in shaped if record.flag("root")), shaped[0]).integer("id")
 
     states = top.records("states")
     motions = {
@@ -96,7 +99,7 @@ def load_ground_truth(capture: Path) -> GroundTruth | None:
         points[part] = load_points(file, Normalization(torch.zeros(3).numpy(), 1.0))[0].double()
     return GroundTruth(
         parts=parts,
-        root=roots[0],
+        root=root,
         joints=joints,
         motions=motions,
         novel=[_read_novel(record, joints, parts) for record in top.records("novel")],
@@ -107,10 +110,11 @@ def load_ground_truth(capture: Path) -> GroundTruth | None:
 
 def _read_joint(record: Record, num_states: int, parts: dict[int, str]) -> TrueJoint:
     kind = record.choice("type", list(_TYPES))
-    parent, child = record.integer("parent_id"), record.integer("child_id")
-    for key, part in (("parent_id", parent), ("child_id", child)):
-        if part not in parts:
-            record.fail(key, f"is {part}", f"parts with geometry are {', '.join(map(str, parts))}")
+    ids = {}
+    for key in ("parent_id", "child_id"):
+        ids[key] = None if key in record.fields and record.fields[key] is None else record.integer(key)
+        if ids[key] is not None and ids[key] not in parts:
+            record.fail(key, f"is {ids[key]}", f"parts with geometry are {', '.join(map(str, parts))}")
     axis = record.tensor("axis", (3,))
     if abs(float(axis.norm()) - 1) > 1e-4:
         record.fail("axis", f"has the length {float(axis.norm()):g}", "give a unit vector")
@@ -118,8 +122,10 @@ def _read_joint(record: Record, num_states: int, parts: dict[int, str]) -> TrueJ
     return TrueJoint(
         name=record.text("name"),
         type=_TYPES[kind],
-        parent=parent,
-        child=child,
+        parent=ids["parent_id"],
+        child=ids["child_id"],
+        parent_name=record.text("parent"),
+        child_name=record.text("child"),
         axis=axis / axis.norm(),
         origin=record.tensor("origin", (3,)),
         values=values - values[0],

@@ -14,7 +14,7 @@ from splatart_ns.capture.capture import UNLABELLED, Capture
 from splatart_ns.capture.view import View
 from splatart_ns.evaluation.ground_truth import GroundTruth, NovelState, TrueJoint
 from splatart_ns.evaluation.joints import find_joint
-from splatart_ns.rasterize.render import Rendering, render
+from splatart_ns.rasterize.render import render
 from splatart_ns.rasterize.ssim import ssim
 
 KEYS = ("psnr", "ssim", "lpips", "accumulation_l1", "part_iou")
@@ -33,14 +33,21 @@ def part_overlap(ids: Tensor, labels: Tensor, parts: Sequence[int]) -> Tensor:
     return torch.tensor([[int((a & b).sum()), int((a | b).sum())] for a, b in pairs])
 
 
-def predicted_parts(rendering: Rendering, ids: Tensor) -> Tensor:
-    """The likeliest part id [C, H, W] of a rendering of one-hot part features [.., P]; 0 where most is background."""
-    shares = torch.cat([1 - rendering.accumulation, rendering.features], dim=-1)
+def predicted_parts(accumulation: Tensor, features: Tensor, ids: Tensor) -> Tensor:
+    """The likeliest part id [H, W] of rendered accumulation [H, W, 1] and one-hot part features [H, W, P].
+
+    `ids` [P] are the ids of the parts; 0 where most is background.
+    """
+    shares = torch.cat([1 - accumulation, features], dim=-1)
     return torch.cat([ids.new_zeros(1), ids])[shares.argmax(-1)]
 
 
 def image_scores(
-    bundle: Bundle, motions: Mapping[str, Tensor], views: Sequence[View], capture: Capture
+    bundle: Bundle,
+    motions: Mapping[str, Tensor],
+    views: Sequence[View],
+    capture: Capture,
+    device: torch.device | str = "cpu",
 ) -> tuple[dict[str, float | None], list[str]]:
     """The scores of the object, its parts moved by `motions`, over views of a capture; and notes on nulls.
 
@@ -49,24 +56,24 @@ def image_scores(
     """
     scores: dict[str, float | None] = dict.fromkeys(KEYS)
     notes = []
-    splat = normalized(moved_splat(bundle, motions), capture.normalization)
-    features, ids = part_features(bundle), torch.tensor([part.id for part in bundle.parts])
+    splat = normalized(moved_splat(bundle, motions), capture.normalization).to(device)
+    features, ids = part_features(bundle).to(device), torch.tensor([part.id for part in bundle.parts])
     white = torch.ones(3)
     per_view: dict[str, list[float]] = {"psnr": [], "ssim": [], "accumulation_l1": []}
     parts = sorted({*ids.tolist(), *capture.parts})
     overlap = torch.zeros(len(parts), 2, dtype=torch.long)
     for view in views:
-        rendering = render(
-            splat, view.viewmat[None], view.K[None], view.width, view.height, features=features, with_depth=False
-        )
+        viewmat, K = view.viewmat[None].to(device), view.K[None].to(device)
+        rendering = render(splat, viewmat, K, view.width, view.height, features=features, with_depth=False)
+        accumulation = rendering.accumulation[0].cpu()
         if view.labels is not None:
-            overlap += part_overlap(predicted_parts(rendering, ids)[0], view.labels.long(), parts)
+            shown = predicted_parts(accumulation, rendering.features[0].cpu(), ids)
+            overlap += part_overlap(shown, view.labels.long(), parts)
         if view.alpha is not None:
-            accumulation = rendering.accumulation[0]
-            image = (rendering.rgb[0] + (1 - accumulation) * white).clamp(0, 1)
+            image = (rendering.rgb[0].cpu() + (1 - accumulation) * white).clamp(0, 1)
             truth = view.rgb_on(white)
             per_view["psnr"].append(psnr(image, truth))
-            per_view["ssim"].append(float(ssim(image[None], truth[None])))
+            per_view["ssim"].append(float(ssim(image, truth)))
             per_view["accumulation_l1"].append(float((accumulation[..., 0] - view.alpha.float() / 255).abs().mean()))
     for key, values in per_view.items():
         scores[key] = sum(values) / len(values) if values else None
@@ -116,6 +123,8 @@ def is_mapped(bundle: Bundle, ground_truth: GroundTruth) -> bool:
     """Whether every true joint has an estimated one of the same pair of parts and the same type."""
     names = {part.id: part.name for part in bundle.parts}
     for truth in ground_truth.joints:
+        if None in (truth.parent, truth.child):
+            return False
         pair = names.get(truth.parent), names.get(truth.child)
         joint = find_joint(bundle, *pair) if None not in pair else None
         if joint is None or not joint.in_tree or JOINT_DOFS[joint.type] != 1 or joint.type != truth.type:

@@ -101,14 +101,16 @@ def joint_errors(truth: TrueJoint, ground_truth: GroundTruth, bundle: Bundle) ->
     names = {part.id: part.name for part in bundle.parts}
     parent, child = names.get(truth.parent), names.get(truth.child)
     record: dict[str, Any] = {
-        "child": ground_truth.parts[truth.child],
-        "parent": ground_truth.parts[truth.parent],
+        "child": truth.child_name,
+        "parent": truth.parent_name,
         "type": truth.type,
         "type_correct": False,
         "parent_correct": False,
         **dict.fromkeys(ERRORS),
         "covered_95": None,
     }
+    if truth.parent is None or truth.child is None:
+        return record, "a part of it has no geometry, so no image shows it"
     if parent is None or child is None:
         return record, "the estimate lacks a part of this joint"
     joint = find_joint(bundle, parent, child)

@@ -11,12 +11,15 @@ from splatart_ns.evaluation.ground_truth import GroundTruth
 def structure_scores(ground_truth: GroundTruth, bundle: Bundle) -> dict[str, Any]:
     """`tree_exact` (root and every parent right), and precision and recall of the accepted graph's edges.
 
-    The accepted graph holds the tree's joints and the loops', without directions; "free" joints connect nothing.
+    The accepted graph holds the tree's joints and the loops', without directions; "free" joints connect nothing. True
+    joints of parts without geometry are left out.
     """
     ids = {part.name: part.id for part in bundle.parts}
     joints = [joint for joint in bundle.joints if joint.type != "free"]
     tree = {(ids[joint.parent], ids[joint.child]) for joint in joints if joint.in_tree}
-    true_tree = {(joint.parent, joint.child) for joint in ground_truth.joints}
+    true_tree = {
+        (joint.parent, joint.child) for joint in ground_truth.joints if None not in (joint.parent, joint.child)
+    }
     edges = {frozenset((ids[joint.parent], ids[joint.child])) for joint in joints}
     true_edges = {frozenset(edge) for edge in true_tree}
     right = len(edges & true_edges)

@@ -87,7 +87,9 @@ class Report:
                 same = all(earlier[key] == self.data[key] for key in ("capture", "settings"))
                 stages = earlier["stages"] if same else []
             except (ValueError, KeyError, TypeError):
-                raise InputError(f"{path} is not a report of `splatart fit`; remove it or choose another folder.") from None
+                raise InputError(
+                    f"{path} is not a report of `splatart fit`; remove it or choose another folder."
+                ) from None
             self.data["stages"] = stages
 
     def finished(self, stage: str) -> bool:
@@ -110,7 +112,9 @@ def fit(
     """
     capture = require_valid(capture_path)
     if root is not None and root not in capture.parts.values():
-        raise InputError(f"{capture_path} has no part '{root}'; choose --root from {', '.join(capture.parts.values())}.")
+        raise InputError(
+            f"{capture_path} has no part '{root}'; choose --root from {', '.join(capture.parts.values())}."
+        )
     output_dir = output_dir.absolute()
     try:
         (output_dir / "runs").mkdir(parents=True, exist_ok=True)

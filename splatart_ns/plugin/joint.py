@@ -66,7 +66,7 @@ class JointModel(SplatartModel):
 
     def _set_joints(self, buffers: dict[str, Tensor]) -> None:
         for name, value in buffers.items():
-            self.register_buffer(name, value.to(self.device))
+            self.register_buffer(name, value.to(self.palette.device))
 
     def start(self, splat: Splat, tree: KinematicTree, motions: Tensor, normalization: Normalization) -> None:
         """Show `splat` (normalised world) on `tree`; tree and motions [S, P, 4, 4] are in the capture's world."""

@@ -55,7 +55,9 @@ class SplatartModel(SplatfactoModel):
         if self.seed_points is not None and not self.config.random_init:
             splat = splat_from_points(*self.seed_points, self.config.sh_degree, self.num_parts)
         else:
-            splat = random_splat(self.config.num_random, self.config.random_scale, self.config.sh_degree, self.num_parts)
+            splat = random_splat(
+                self.config.num_random, self.config.random_scale, self.config.sh_degree, self.num_parts
+            )
         self.gauss_params = nn.ParameterDict(gauss_params_from_splat(splat))
         self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.register_buffer("palette", part_colours(self.num_parts), persistent=False)

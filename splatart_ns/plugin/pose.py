@@ -26,6 +26,7 @@ from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.pose_evidence import motion_covariances, rotation_held_ratios
 from splatart_ns.stages.render_choice import initial_motion
+from splatart_ns.stages.visibility import visibility
 
 
 @dataclass
@@ -147,12 +148,13 @@ class PosePipeline(VanillaPipeline):
         if self.config.init == "file":
             return self._poses_from_file(base), frozen
         centroids = [part_extents(s, P)[0].cpu() for s in splats]
+        seen = [visibility(s, v) for s, v in zip(splats, self.views, strict=True)]
         for s in range(1, S):
             for p in range(P):
                 if self.config.init == "centroids":
                     base[s, p, :3, 3] = centroids[s][p] - centroids[0][p]
                     continue
-                pair = (splats[0], splats[s]), (self.views[0], self.views[s])
+                pair = [(everything[0], everything[s]) for everything in (splats, self.views, seen)]
                 motion = initial_motion(*pair, p + 1, self.config.seed)
                 name = f"part {self.model.part_names[p + 1]}, state {s}"
                 if not motion.found:

@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from splatart_ns.rasterize.numba_binning import bin_gaussians
 from splatart_ns.rasterize.numba_compositing import MIN_CHANNELS, composite, composite_backward, gather_gradients
-from splatart_ns.rasterize.numba_threads import balanced_bounds, even_bounds, num_workers, run
+from splatart_ns.rasterize.numba_runtime import balanced_bounds, even_bounds, num_workers, run
 
 
 def rasterize_to_pixels(
@@ -30,8 +30,8 @@ def rasterize_to_pixels(
 ) -> tuple[Tensor, Tensor]:
     """Composite projected Gaussians front to back over black.
 
-    Arguments and results are those of `torch_backend.rasterize_to_pixels`, float32 and on the CPU. The number of threads
-    is torch's; results do not depend on it, to the last bit.
+    Arguments and results are those of `torch_backend.rasterize_to_pixels`, float32 and on the CPU. The number of
+    threads is torch's; results do not depend on it, to the last bit.
     """
     return _Rasterize.apply(means2d, conics, opacities, colors, depths, visible, width, height, absgrad)
 

@@ -6,9 +6,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from splatart_ns.rasterize.numba_threads import JIT, even_bounds, num_workers, run
+from splatart_ns.rasterize.numba_runtime import even_bounds, jit, num_workers, run
 
 TILE = 8
 """Side of a tile, pixels."""
@@ -41,7 +40,7 @@ class Bins(NamedTuple):
     """[G, 6] (x, y, f, s, h, k): log2(alpha) = f (dx + s dy)^2 + h dy^2 + k at (dx, dy) from the mean (x, y)."""
 
 
-@njit(**JIT)
+@jit
 def _extents(begin, end, worker, means, conics, opacities, visible, width, height, coefficients, ellipses, rows):
     """Fills the coefficients, ellipses [G, 2] (half width in x, squared radius) and rows [G, 2] (first, one past last).
 
@@ -78,9 +77,9 @@ def _extents(begin, end, worker, means, conics, opacities, visible, width, heigh
         coefficients[g, 5] = math.log2(opacity)
 
 
-@njit(**JIT)
+@jit
 def _depth_order(depths, rows, gaussians_per_camera):
-    """Gaussians that have rows [S], by camera and then by depth, and where their rows start [S + 1]. A stable radix sort."""
+    """Gaussians that have rows [S], by camera, then depth (stable radix sort), and where their rows start [S + 1]."""
     order = np.empty(depths.shape[0], np.int32)
     total = 0
     for start in range(0, depths.shape[0], gaussians_per_camera):
@@ -117,7 +116,7 @@ def _depth_order(depths, rows, gaussians_per_camera):
     return order[:total], row_offsets
 
 
-@njit(**JIT)
+@jit
 def _spans(begin, end, worker, order, row_offsets, means, conics, ellipses, rows, size, grid, spans, tallies, sizes):
     """Fills the spans [., 2] of tiles (first, one past last) of each sorted Gaussian's rows.
 
@@ -141,7 +140,7 @@ def _spans(begin, end, worker, order, row_offsets, means, conics, ellipses, rows
             high = min(min(row * TILE + TILE - 0.5, height - 0.5) - y, half_y)
             first, past = 0, 0
             if low <= high:
-                # The ellipse a dx^2 + 2 b dx dy + c dy^2 = radius2 is convex: extreme at the tip, or as near as the row lets.
+                # The ellipse a dx^2 + 2 b dx dy + c dy^2 = radius2 is extreme at the tip, or as near as the row lets.
                 right = min(max(-tip, low), high)
                 left = min(max(tip, low), high)
                 x_right = x + (math.sqrt(max(radius2 * a - det * right * right, 0.0)) - b * right) / a
@@ -161,7 +160,7 @@ def _spans(begin, end, worker, order, row_offsets, means, conics, ellipses, rows
         sizes[k] = count
 
 
-@njit(**JIT)
+@jit
 def _offsets(tallies, sizes):
     """Turns tallies into where each worker's pairs of each tile start; returns the prefix sums by tile and Gaussian."""
     tile_offsets = np.empty(tallies.shape[1] + 1, np.int64)
@@ -179,7 +178,7 @@ def _offsets(tallies, sizes):
     return tile_offsets, slot_offsets
 
 
-@njit(**JIT)
+@jit
 def _fill(begin, end, worker, order, row_offsets, rows, spans, slot_offsets, grid, places, gaussians, slots):
     """Lists the pairs by tile."""
     tiles_x, tiles_y, per_camera = grid

@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from splatart_ns.rasterize.numba_binning import PIXELS, TILE
-from splatart_ns.rasterize.numba_threads import JIT
+from splatart_ns.rasterize.numba_runtime import jit
 
 MIN_CHANNELS = 4
 """The least number of channels: fewer are padded."""
@@ -31,7 +30,7 @@ _E3, _E4, _E5 = np.float32(0.05582631781272315), np.float32(0.00898934037714072)
 _X, _Y, _T, _W, _A, _COLOR = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIXELS, 5 * PIXELS
 
 
-@njit(**JIT)
+@jit
 def _alpha(log2_alpha):
     """2^log2_alpha, cut to 0 below 1/255 and to 0.999."""
     exponent = min(max(log2_alpha, np.float32(-9)), _LOG2_ALPHA_MAX)
@@ -42,7 +41,7 @@ def _alpha(log2_alpha):
     return power * scale if log2_alpha >= _LOG2_ALPHA_MIN else _ZERO
 
 
-@njit(**JIT)
+@jit
 def _at_tile(coefficients, left, top):
     """u0, y0, f, s, h, k, such that log2(alpha) = f (u0 + x + s y)^2 + h (y0 + y)^2 + k in the tile's coordinates x, y.
 
@@ -53,7 +52,7 @@ def _at_tile(coefficients, left, top):
     return np.float32(u0), np.float32(top - y), np.float32(f), np.float32(s), np.float32(h), np.float32(k)
 
 
-@njit(**JIT)
+@jit
 def _start_tile(work):
     """Fills in the tile-local pixel coordinates and full transmittance."""
     for p in range(PIXELS):
@@ -62,7 +61,7 @@ def _start_tile(work):
         work[_T + p] = _ONE
 
 
-@njit(**JIT)
+@jit
 def composite(begin, end, worker, bins, colors, render, alphas, depths):
     """Renders the tiles begin..end into render [C, H, W, D] and alphas [C, H, W, 1].
 
@@ -124,7 +123,7 @@ def composite(begin, end, worker, bins, colors, render, alphas, depths):
                     render[camera, row * TILE + i, column * TILE + j, d] = more[d - MIN_CHANNELS, p]
 
 
-@njit(**JIT)
+@jit
 def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alphas, wants, moments, v_colors):
     """Gradients of the tiles begin..end's pairs, by slot.
 
@@ -263,7 +262,7 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
                     v_colors[slot, MIN_CHANNELS + d] = v0
 
 
-@njit(**JIT)
+@jit
 def gather_gradients(
     begin, end, worker, bins, moments, pair_colors, wants, v_means, v_conics, v_opacities, v_colors, absgrad
 ):

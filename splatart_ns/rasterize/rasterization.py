@@ -160,10 +160,14 @@ def sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int) -> Tenso
     `sh` is [N, K, 3] or [C, N, K, 3], K >= (degree + 1)^2.
     """
     R, t = viewmats[:, :3, :3], viewmats[:, :3, 3:]
-    camera = -(R.mT @ t)[..., 0]
-    dirs = torch.nn.functional.normalize(means - camera[:, None], dim=-1)
-    basis = sh_basis(dirs, degree)
-    return ((basis[..., None] * sh[..., : basis.shape[-1], :]).sum(-2) + 0.5).clamp_min(0)
+    offsets = (means.T + R.mT @ t).mT  # means - camera centre [C, N, 3], components contiguous
+    norm2 = offsets.square().sum(-1, keepdim=True)
+    basis = sh_basis(offsets * norm2.clamp_min(1e-24).rsqrt(), degree)
+    # Sums over the bands as matrix products: reducing [..., K, 3] over K is several times slower.
+    K = basis.shape[-1]
+    identity = torch.eye(max(K, 3), dtype=sh.dtype, device=sh.device)
+    per_channel = basis @ identity[:K, :K].repeat_interleave(3, dim=1)
+    return (per_channel * sh[..., :K, :].flatten(-2) @ identity[:3, :3].repeat(K, 1) + 0.5).clamp_min(0)
 
 
 def _compositor(backend: Backend):

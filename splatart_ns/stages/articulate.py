@@ -50,8 +50,11 @@ class KinematicTree:
         return [j for j in self.joints if j.fit.type != "fixed"]
 
     def observed(self) -> Tensor:
-        """The configurations [S, J] of the observed states."""
-        return torch.stack([j.fit.values for j in self.movable], -1)
+        """The configurations [S, J] of the observed states; a tree without joints has but one."""
+        states = len(self.joints[0].fit.values) if self.joints else 1
+        return (
+            torch.stack([j.fit.values for j in self.movable], -1) if self.movable else torch.zeros(states, 0).double()
+        )
 
 
 def forward_kinematics(
@@ -75,8 +78,8 @@ def forward_kinematics(
     if q.shape[-1] != len(movable):
         raise ValueError(f"a configuration of {q.shape[-1]} values for {len(movable)} movable joints")
     if clamp:
-        low, high = (torch.tensor(side).to(q) for side in zip(*(j.fit.limits for j in movable), strict=True))
-        q = q.clamp(low, high)
+        limits = torch.tensor([j.fit.limits for j in movable]).reshape(-1, 2).to(q)
+        q = q.clamp(limits[:, 0], limits[:, 1])
     root = torch.eye(4).to(q) if root_motion is None else root_motion.to(q)
     root = root.expand(*torch.broadcast_shapes(root.shape[:-2], q.shape[:-1]), 4, 4)
     motions = {tree.root: root}

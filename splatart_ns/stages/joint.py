@@ -7,9 +7,10 @@ a covariance of the motion is known it takes the place of that form: it says whi
 
 The noise decides between types. A registration that is wrong by a length s at the surface turns a part of radius r by
 about s / r, so the noise model is s^2 times the inverse of the points' quadratic form: a finger of a few pixels may
-turn by degrees where a door may not. The score of a type is chi^2 + 6 per parameter, lowest wins: a freedom must buy
-more than about 2.5 standard deviations. Two states make this necessary: there a revolute joint (5 parameters for 6
-numbers) imitates almost every sliding one (3).
+turn by degrees where a door may not. The score of a type is chi^2 + 4 per parameter: a freedom must buy two standard
+deviations. The lowest score wins among the types that are accepted, whose residual is small or explained by the
+noise. Two states make all this necessary: there a revolute joint (5 parameters for 6 numbers) imitates almost every
+sliding one (3).
 """
 
 from __future__ import annotations
@@ -35,11 +36,14 @@ from splatart_ns.geometry.se3 import (
 
 NOISE = 0.003
 """Default registration error of a part's surface, as a share of the object's bounding radius."""
+EPSILON = 0.02
+"""Default limit of the residual, as a share of the object's bounding radius."""
 PRISMATIC_BELOW = 1.2
 """A joint slides if holding the rotation raises the rendering cost by less than this factor."""
-_PENALTY = 6.0  # score of one parameter
+_PENALTY = 4.0  # score of one parameter
+_EXPLAINED = 3.0  # chi^2 per observed number that is still put down to the noise
 _MAX_ITERATIONS = 30
-_LEAST_RADIUS = 0.005  # of the object's radius: no part's turn is known better than by this lever
+_LEAST_LEVER = 0.005  # of the object's radius
 _UNDETERMINED_AXIS = math.radians(15)
 _UNDETERMINED_ORIGIN = 0.25  # of the object's radius
 _UNKNOWN_ROTATION = math.radians(5)
@@ -65,6 +69,8 @@ class JointFit:
     """chi^2 plus a penalty per parameter: the lower, the better supported."""
     chi2: float = math.nan
     """Squared residual in units of the noise."""
+    accepted: bool = True
+    """Whether the residual is within the limit, or no more than the noise explains."""
     converged: bool = True
     iterations: int = 0
     covariance: dict[str, list] = field(default_factory=dict)
@@ -115,16 +121,16 @@ def joint_motion(kind: str, axis: Tensor, origin: Tensor, pitch: float | Tensor,
     return Screw(axis.expand(shape), origin.expand(shape), turn, slide).motion()
 
 
-def surface_noise(points: Tensor, sigma: float, floor: float) -> Tensor:
-    """Covariance [6, 6] of a motion about the centroid of points [N, 3], known to `sigma` (length) at the points.
+def surface_noise(points: Tensor, noise: float, object_radius: float) -> Tensor:
+    """Covariance [6, 6] of a motion about the centroid of points [N, 3], known to `noise` x `object_radius` at them.
 
-    sigma^2 times the inverse of the quadratic form whose value at a small motion is the points' mean squared
-    displacement. `floor` (length) is the least radius a part is taken to have: a rod's turn about itself.
+    The variance times the inverse of the quadratic form whose value at a small motion is the points' mean squared
+    displacement. The lever of a turn is at least 0.005 of the object's radius, as for a rod that turns about itself.
     """
     x = points - points.mean(0)
     C = x.mT @ x / x.shape[0]
-    inertia = C.trace() * torch.eye(3).to(C) - C + floor**2 * torch.eye(3).to(C)
-    return sigma**2 * torch.block_diag(torch.eye(3).to(C), torch.linalg.inv(inertia))
+    inertia = (C.trace() + (_LEAST_LEVER * object_radius) ** 2) * torch.eye(3).to(C) - C
+    return (noise * object_radius) ** 2 * torch.block_diag(torch.eye(3).to(C), torch.linalg.inv(inertia))
 
 
 def mean_distance(points: Tensor, T_a: Tensor, T_b: Tensor) -> float:
@@ -139,6 +145,7 @@ def fit_joint(
     covariance: Tensor | None = None,
     object_radius: float | None = None,
     noise: float = NOISE,
+    epsilon: float = EPSILON,
     render_ratio: float | None = None,
     types: Sequence[str] = ("fixed", "prismatic", "revolute"),
 ) -> JointFit:
@@ -148,13 +155,14 @@ def fit_joint(
     `points` [N, 3]: the child's points at state 0. `covariance` [S, 6, 6]: of the motions, T_true = exp(d) T_rel with
     d = (translation, rotation) about the world's origin; without it, and always as a floor, the surface noise of the
     module's head at `noise` times `object_radius` (the child's own bounding radius where the object's is not given).
+    Types that leave more than `epsilon` x `object_radius`, and more than the noise explains, are not accepted.
     `render_ratio`: rendering cost with the rotation held over the cost of the free fit; where given, it alone chooses
     between turning and sliding. `types` may include "screw", which only three or more states can tell from revolute.
     """
     if object_radius is None:
         object_radius = float(torch.linalg.vector_norm(points - points.mean(0), dim=-1).max())
     covariances = None if covariance is None else covariance[None]
-    return fit_joints(T_rel[None], [points], object_radius, covariances, noise, [render_ratio], types)[0]
+    return fit_joints(T_rel[None], [points], object_radius, covariances, noise, epsilon, [render_ratio], types)[0]
 
 
 def fit_joints(
@@ -163,6 +171,7 @@ def fit_joints(
     object_radius: float,
     covariances: Tensor | None = None,
     noise: float = NOISE,
+    epsilon: float = EPSILON,
     render_ratios: Sequence[float | None] | None = None,
     types: Sequence[str] = ("fixed", "prismatic", "revolute"),
 ) -> list[JointFit]:
@@ -175,7 +184,7 @@ def fit_joints(
     centroids = torch.stack([x.mean(0) for x in points])
     about = from_rotation_translation(torch.eye(3).to(T_rel), centroids)[:, None]
     T = (inverse(about) @ T_rel @ about)[:, 1:]
-    floor = [surface_noise(x, noise * object_radius, _LEAST_RADIUS * object_radius) for x in points]
+    floor = [surface_noise(x, noise, object_radius) for x in points]
     errors = torch.stack(floor)[:, None].expand(*T.shape[:2], 6, 6)
     if covariances is not None:
         to_body = adjoint(inverse(T_rel @ about)[:, 1:])
@@ -186,17 +195,21 @@ def fit_joints(
     fits = zip(*(_fit(kind, T, whiten, points) for kind in types), strict=True)
     ratios = render_ratios or [None] * len(points)
     return [
-        _choose([replace(f, origin=f.origin + c) for f in pair], ratio, float(sigma), object_radius)
+        _choose([replace(f, origin=f.origin + c) for f in pair], ratio, float(sigma), object_radius, epsilon)
         for pair, c, ratio, sigma in zip(fits, centroids, ratios, worst_rotation, strict=True)
     ]
 
 
-def _choose(fits: list[JointFit], render_ratio: float | None, rotation_sigma: float, object_radius: float) -> JointFit:
-    best = min(fits, key=lambda f: f.score)
+def _choose(
+    fits: list[JointFit], render_ratio: float | None, rotation_sigma: float, object_radius: float, epsilon: float
+) -> JointFit:
+    limit = _EXPLAINED * 6 * (len(fits[0].values) - 1)
+    fits = [replace(f, accepted=f.residual <= epsilon * object_radius or f.chi2 <= limit) for f in fits]
+    best = min(fits, key=lambda f: (not f.accepted, f.score))
     if render_ratio is not None and best.type != "fixed":
         slides = render_ratio < PRISMATIC_BELOW
-        moving = [f for f in fits if f.type != "fixed" and (f.type == "prismatic") == slides]
-        best = min(moving, key=lambda f: f.score, default=best)
+        allowed = [f for f in fits if f.type != "fixed" and (f.type == "prismatic") == slides]
+        best = min(allowed, key=lambda f: f.score, default=best)
     others = sorted((f for f in fits if f is not best), key=lambda f: f.score)
     unseen_turn = best.type == "prismatic" and rotation_sigma > _UNKNOWN_ROTATION
     close = any(f.score < best.score + _PENALTY for f in others)

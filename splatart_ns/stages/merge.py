@@ -11,9 +11,10 @@ from torch import Tensor
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import inverse, matrix_from_quat
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.visibility import SEEN, visibility
+from splatart_ns.stages.visibility import shown, visibility
 
-MIN_OPACITY = 0.02
+SHOWN = 0.999
+"""Gaussians beyond this share of a part's visibility are left out."""
 COVERED = 2.0
 """A centre within so many standard deviations of a Gaussian is where that Gaussian already is."""
 
@@ -40,12 +41,12 @@ def _pixel_footprint(views: Sequence[View]) -> float:
 
 
 def _merge_part(splats: Sequence[Splat], seen: Sequence[Tensor], T: Tensor, part: int, footprint: float) -> Splat:
-    pieces, shown = [], []
-    for splat, most, pose in zip(splats, seen, T, strict=True):
-        needed = (splat.part_ids == part) & (splat.opacities > MIN_OPACITY) & (most > SEEN)
-        pieces.append(splat.select(needed).detach().transformed(inverse(pose)))
-        shown.append(float(most[needed].sum()))
-    order = sorted(range(len(pieces)), key=lambda s: -shown[s])
+    pieces, amount = [], []
+    for splat, visible, pose in zip(splats, seen, T, strict=True):
+        visible = torch.where(splat.part_ids == part, visible, 0.0)
+        pieces.append(splat.select(shown(visible, SHOWN) & (visible > 0)).detach().transformed(inverse(pose)))
+        amount.append(float(visible.sum()))
+    order = sorted(range(len(pieces)), key=lambda s: -amount[s])
     merged = pieces[order[0]]
     for s in order[1:]:
         merged = Splat.cat([merged, pieces[s].select(~covered(pieces[s].means, merged, footprint))])

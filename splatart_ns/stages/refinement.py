@@ -22,8 +22,6 @@ class Refinement:
     """The motion [4, 4] float64."""
     cost: float
     """Mean Huber cost per own pixel."""
-    covariance: Tensor
-    """Of the motion [6, 6] float64, tangent (translation, rotation): T = se3_exp(xi) T_true, in the world frame."""
     converged: bool
     iterations: int
 
@@ -39,7 +37,7 @@ def increment(T: Tensor, xi: Tensor, centroid: Tensor, radius: float) -> Tensor:
 def refine(pair: PartPair, T: Tensor, max_iterations: int = 6, hold_rotation: bool = False) -> Refinement:
     """Levenberg-Marquardt from T [4, 4] on all pixels of the pair, robust by Huber weights.
 
-    `hold_rotation` moves only the translation; the covariance of the rotation is then 0.
+    `hold_rotation` moves only the translation.
     """
     T = T.double()
     n = 3 if hold_rotation else 6
@@ -59,7 +57,7 @@ def refine(pair: PartPair, T: Tensor, max_iterations: int = 6, hold_rotation: bo
         else:
             damping = max(damping, 1e-3) * 10
             converged = damping > 1e2 or bool(step.abs().max() < 0.1 * STEP)
-    return Refinement(T, equations.cost, _covariance(pair, T, equations), converged, iteration)
+    return Refinement(T, equations.cost, converged, iteration)
 
 
 @dataclass(frozen=True)
@@ -92,17 +90,22 @@ def _normal_equations(pair: PartPair, T: Tensor, n: int) -> _NormalEquations:
     return _NormalEquations(H, torch.stack(gradients), cost / max(pair.area, 1.0))
 
 
-def _covariance(pair: PartPair, T: Tensor, equations: _NormalEquations) -> Tensor:
-    """Sandwich estimate with the views as clusters [6, 6] (Liang and Zeger 1986).
+def motion_covariance(pair: PartPair, T: Tensor) -> Tensor:
+    """How uncertain a refined motion T [4, 4] is [6, 6] float64.
 
-    Neighbouring pixels err together (edges, shadows, a mixed Gaussian), so each view counts as one observation, however
-    many pixels it has.
+    The tangent is (translation, rotation) of a left increment in the world frame: T = se3_exp(xi) T_true, so that the
+    translation is that of the world's origin. A sandwich estimate with views as clusters (Liang and Zeger 1986):
+    neighbouring pixels err together (edges, shadows, a mixed Gaussian), so each view counts as one observation, however
+    many pixels it has. Views of one state share the other state's Gaussians and err together too: what the two
+    directions disagree by is added.
     """
-    V, n = equations.g.shape
+    T = T.double()
+    equations = _normal_equations(pair, T, 6)
+    V = len(equations.g)
+    g = equations.g - equations.g.mean(0)
+    directions = torch.stack([d.sum(0) for d in g.split([len(pair.views[1]), len(pair.views[0])])])
     H_inv = torch.linalg.pinv(equations.H, hermitian=True)
-    meat = equations.g.T @ equations.g * (V / max(V - 1, 1))
-    local = torch.zeros(6, 6, dtype=T.dtype, device=T.device)
-    local[:n, :n] = H_inv @ meat @ H_inv
+    local = H_inv @ (V / max(V - 6, 1) * g.T @ g + directions.T @ directions) @ H_inv
     # From (radii, radians) about the moved centroid to the world's origin.
     A = torch.eye(6, dtype=T.dtype, device=T.device)
     A[:3, :3] *= pair.radius

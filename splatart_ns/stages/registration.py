@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.visibility import SEEN
+from splatart_ns.stages.visibility import shown
 
 MIN_POINTS = 8
 """A part with fewer Gaussians than this in a state cannot be registered."""
@@ -58,7 +59,8 @@ class Registration:
 
 def part_points(splat: Splat, seen: Tensor, part: int) -> PartPoints:
     """The visible Gaussians whose most likely part is `part`; `seen` [N] is the splat's `visibility`."""
-    chosen = (splat.part_ids == part) & (seen > SEEN)
+    chosen = splat.part_ids == part
+    chosen &= shown(torch.where(chosen, seen, 0.0))
     part_splat = splat.select(chosen).detach().to("cpu")
     # 0.28209 is the constant spherical harmonic.
     rgb = 0.5 + 0.28209479177387814 * part_splat.sh[:, 0].double().numpy()

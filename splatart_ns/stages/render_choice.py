@@ -14,6 +14,7 @@ from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import PartPair, part_pair
 from splatart_ns.stages.refinement import refine
 from splatart_ns.stages.registration import MIN_POINTS, distinct, part_points, point_to_plane, register
+from splatart_ns.stages.visibility import visibility
 
 VIEWS = 5
 """Views of each state that are compared."""
@@ -46,10 +47,20 @@ class InitialMotion:
 
 
 def initial_motion(
-    splats: tuple[Splat, Splat], views: tuple[Sequence[View], Sequence[View]], part: int, seed: int = 0
+    splats: tuple[Splat, Splat],
+    views: tuple[Sequence[View], Sequence[View]],
+    seen: tuple[Tensor, Tensor],
+    part: int,
+    seed: int = 0,
 ) -> InitialMotion:
-    """The motion of one part between two states, `splats` and `views` (training views) of the one and the other."""
-    source, target = (part_points(s, part) for s in splats)
+    """The motion of one part between two states.
+
+    Args:
+        splats: The labelled splats of the one and the other state.
+        views: Their training views.
+        seen: The `visibility` of each state's Gaussians.
+    """
+    source, target = (part_points(s, v, part) for s, v in zip(splats, seen, strict=True))
     identity = torch.eye(4, dtype=torch.float64, device=splats[0].means.device)
     if min(len(source.xyz), len(target.xyz)) < MIN_POINTS:
         return InitialMotion(identity, found=False)
@@ -59,7 +70,12 @@ def initial_motion(
     fine = part_pair(splats, views, part, VIEWS, FINE_PIXELS)
     if coarse is None or fine is None:
         return InitialMotion(candidates[0], found=True)
-    ends = [refine(fine, T, max_iterations=4) for T in choose(coarse, torch.cat([identity[None], candidates]))]
+    candidates = choose(coarse, torch.cat([identity[None], candidates]), SIMILAR)
+    if float(coarse.cost(identity[None])[0]) < STILL_RATIO * float(coarse.cost(candidates[:1])[0]):
+        candidates = identity[None]
+    if len(candidates) > 1:
+        candidates = choose(coarse, torch.stack([refine(coarse, T, 5).T for T in candidates]), 1.5)
+    ends = [refine(fine, T, 10) for T in candidates]
     cost = np.array([e.cost for e in ends])
     order = distinct(torch.stack([e.T for e in ends]).cpu().numpy(), cost, source.centroid, source.radius)
     best = ends[order[0]]
@@ -75,8 +91,41 @@ def initial_motion(
     )
 
 
-def choose(pair: PartPair, candidates: Tensor, keep: int = 3) -> Tensor:
-    """The distinct motions [K, 4, 4] among `candidates` [C, 4, 4] that render best, best first."""
+@dataclass(frozen=True)
+class InitialPoses:
+    """Where `PartPoses` may start."""
+
+    T: Tensor
+    """T[state][part] [S, P, 4, 4] float64, the identity at state 0."""
+    frozen: Tensor
+    """Poses that are not to be refined [S, P]: state 0, still parts, and parts that were not found."""
+    motions: list[list[InitialMotion]]
+    """Of every part, for the states from 1 on."""
+
+
+def initial_poses(
+    splats: Sequence[Splat], views: Sequence[Sequence[View]], num_parts: int, seed: int = 0
+) -> InitialPoses:
+    """Initial poses of parts 1..num_parts, from one labelled splat and the training views per state."""
+    seen = [visibility(s, v) for s, v in zip(splats, views, strict=True)]
+    motions = [
+        [
+            initial_motion((splats[0], splats[s]), (views[0], views[s]), (seen[0], seen[s]), part, seed)
+            for part in range(1, num_parts + 1)
+        ]
+        for s in range(1, len(splats))
+    ]
+    T = torch.stack([torch.stack([m.T for m in of_state]) for of_state in motions])
+    frozen = torch.tensor([[m.still or not m.found for m in of_state] for of_state in motions], device=T.device)
+    identity = torch.eye(4).to(T).expand(1, num_parts, 4, 4)
+    return InitialPoses(torch.cat([identity, T]), torch.cat([torch.ones_like(frozen[:1]), frozen]), motions)
+
+
+def choose(pair: PartPair, candidates: Tensor, similar: float, keep: int = 3) -> Tensor:
+    """The distinct motions [K, 4, 4] among `candidates` [C, 4, 4] that render best, best first.
+
+    At most `keep`, and none that costs more than `similar` times the best.
+    """
     cost = pair.cost(candidates).cpu().numpy()
     order = distinct(candidates.cpu().numpy(), cost, pair.centroid.cpu().numpy(), pair.radius)
-    return candidates[[i for i in order[:keep] if cost[i] <= SIMILAR * cost[order[0]]]]
+    return candidates[[i for i in order[:keep] if cost[i] <= similar * cost[order[0]]]]

@@ -1,6 +1,6 @@
 """Stage 4: which parts hang on which.
 
-All pairs of parts are fitted; a pair whose residual is small joins the graph; the tree is the spanning tree of least
+All pairs of parts are fitted; the pairs whose fit is accepted make the graph; the tree is the spanning tree of least
 cost. A pair costs what speaks against a joint there, in shares of the object's radius: the residual, the gap between
 the two parts (a joint keeps them in touch), and the distance of a turning axis from the place where they touch. With
 two states kinematics alone cannot find the tree: about as many false pairs as true ones move like joints, two drawers
@@ -18,10 +18,7 @@ from torch import Tensor
 from splatart_ns.geometry.se3 import adjoint, inverse, transform_points
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.contact import Contact, find_contacts
-from splatart_ns.stages.joint import NOISE, JointFit, fit_joint, fit_joints, surface_noise
-
-EPSILON = 0.02
-"""Default limit of an accepted joint's residual, as a share of the object's bounding radius."""
+from splatart_ns.stages.joint import EPSILON, NOISE, JointFit, fit_joint, fit_joints, surface_noise
 
 
 def object_radius(points: dict[int, Tensor]) -> float:
@@ -45,13 +42,15 @@ def infer_tree(
     """Joints and tree from the parts' points [N, 3] at state 0 and their motions [S, 4, 4], both by part id.
 
     `covariances` [S, 6, 6]: of the motions, T_true = exp(d) T with d = (translation, rotation) about the world's
-    origin. `render_ratios` by (parent, child) in either order, `noise` and `epsilon` as in `fit_joint`, `build_tree`.
+    origin. `render_ratios` by (parent, child) in either order; `noise` and `epsilon` as in `fit_joint`.
     """
     radius = object_radius(points)
-    joints = fit_pairs(points, motions, radius, covariances=covariances, render_ratios=render_ratios, noise=noise)
+    joints = fit_pairs(
+        points, motions, radius, covariances=covariances, render_ratios=render_ratios, noise=noise, epsilon=epsilon
+    )
     if root is None:
         root = choose_root(points, motions, radius, noise)
-    return build_tree(sorted(points), joints, find_contacts(points, motions), root, radius, epsilon)
+    return build_tree(sorted(points), joints, find_contacts(points, motions), root, radius)
 
 
 def fit_pairs(
@@ -62,6 +61,7 @@ def fit_pairs(
     covariances: dict[int, Tensor] | None = None,
     render_ratios: dict[tuple[int, int], float] | None = None,
     noise: float = NOISE,
+    epsilon: float = EPSILON,
 ) -> dict[tuple[int, int], JointFit]:
     """Joints of all pairs by (parent, child), both ways round; arguments as in `infer_tree`."""
     pairs = [(a, b) for a in sorted(points) for b in sorted(points) if a < b]
@@ -82,6 +82,7 @@ def fit_pairs(
         object_radius,
         to_parent @ known @ to_parent.mT,
         noise,
+        epsilon,
         [ratios.get((a, b), ratios.get((b, a))) for a, b in pairs],
     )
     joints = {}
@@ -96,7 +97,7 @@ def _surface_error(points: Tensor, T: Tensor, noise: float, object_radius: float
     about = torch.eye(4).to(T)
     about[:3, 3] = points.mean(0)
     to_world = adjoint(T @ about)
-    return to_world @ surface_noise(points, noise * object_radius, 0.005 * object_radius) @ to_world.mT
+    return to_world @ surface_noise(points, noise, object_radius) @ to_world.mT
 
 
 def choose_root(
@@ -119,15 +120,14 @@ def build_tree(
     contacts: Mapping[tuple[int, int], Contact],
     root: int,
     object_radius: float,
-    epsilon: float = EPSILON,
 ) -> KinematicTree:
-    """The spanning tree of least total cost from `root` over the joints with residual <= `epsilon` x object_radius.
+    """The spanning tree of least total cost from `root` over the accepted joints.
 
     `joints` by (parent, child), both ways round; `contacts` by (a, b), a < b.
     """
     graph = {}
     for (parent, child), fit in joints.items():
-        if fit.residual <= epsilon * object_radius:
+        if fit.accepted:
             graph[parent, child] = _weighed(parent, child, fit, contacts[_pair(parent, child)], object_radius)
     reached, chosen = {root}, []
     while open_edges := [j for j in graph.values() if j.parent in reached and j.child not in reached]:
@@ -145,9 +145,9 @@ def build_tree(
         if _pair(j.parent, j.child) not in taken and j.parent in order and order[j.parent] < order.get(j.child, -1)
     ]
     rest.sort(key=lambda j: j.cost)
-    loops = [j for j in rest if _closes_loop(tree, j, contacts[_pair(j.parent, j.child)], object_radius, epsilon)]
+    loops = [j for j in rest if _closes_loop(tree, j, contacts[_pair(j.parent, j.child)], object_radius)]
     rejected = [j for j in rest if j not in loops]
-    unattached = {p: _why_unattached(p, reached, joints, epsilon, object_radius) for p in part_ids if p not in reached}
+    unattached = {p: _why_unattached(p, reached, joints, object_radius) for p in part_ids if p not in reached}
     return replace(tree, loops=loops, rejected=rejected, unattached=unattached)
 
 
@@ -160,7 +160,7 @@ def _weighed(parent: int, child: int, fit: JointFit, contact: Contact, object_ra
     return Joint(parent, child, fit, contact.gap, (fit.residual + contact.gap + off_axis) / object_radius)
 
 
-def _closes_loop(tree: KinematicTree, joint: Joint, contact: Contact, object_radius: float, epsilon: float) -> bool:
+def _closes_loop(tree: KinematicTree, joint: Joint, contact: Contact, object_radius: float) -> bool:
     """Whether a joint outside the tree is one of the object's, and not an accident or a consequence of the tree.
 
     It must be as well supported as the tree's own joints between the two parts (in touch, axis at the contact), and
@@ -181,7 +181,7 @@ def _closes_loop(tree: KinematicTree, joint: Joint, contact: Contact, object_rad
     T = dict(zip(tree.part_ids, forward_kinematics(tree, q).unbind(1), strict=True))
     T_rel = torch.cat([torch.eye(4).to(q)[None], inverse(T[joint.parent]) @ T[joint.child]])
     free = fit_joint(T_rel, contact.points.cpu(), object_radius=object_radius, types=(joint.fit.type,))
-    return free.residual > epsilon * object_radius
+    return free.residual > EPSILON * object_radius
 
 
 def _path(tree: KinematicTree, part: int) -> set[int]:
@@ -195,7 +195,7 @@ def _path(tree: KinematicTree, part: int) -> set[int]:
 
 
 def _why_unattached(
-    part: int, reached: set[int], joints: Mapping[tuple[int, int], JointFit], epsilon: float, object_radius: float
+    part: int, reached: set[int], joints: Mapping[tuple[int, int], JointFit], object_radius: float
 ) -> str:
     tried = [
         (fit.residual / object_radius, p, fit.type) for (p, c), fit in joints.items() if c == part and p in reached
@@ -205,5 +205,5 @@ def _why_unattached(
     residual, parent, kind = min(tried)
     return (
         f"No joint explains how part {part} moves: the best, {kind} on part {parent}, leaves {residual:.1%} of the "
-        f"object's radius, and the limit is {epsilon:.1%}."
+        "object's radius, more than the limit and than noise would."
     )

@@ -13,23 +13,28 @@ from splatart_ns.splats.splat import Splat
 
 MAX_VIEWS = 40
 """More views than this add nothing to the answer."""
-SEEN = 0.05
-"""A Gaussian whose visibility is less is hidden: no image says where it should be."""
 
 
 def visibility(splat: Splat, views: Sequence[View]) -> Tensor:
-    """The most that each Gaussian contributes to any view [N], in pixels: its blending weights summed over the image.
+    """What each Gaussian contributes to a view [N], in pixels: its blending weights summed over the image.
 
-    The gradient of a rendering with respect to a feature channel is the sum of blending weights, so one backward pass
-    a view measures all Gaussians.
+    The mean over all views. The gradient of a rendering with respect to a feature channel is the sum of blending
+    weights, so one backward pass a view measures all Gaussians.
     """
     splat = splat.detach()
-    most = torch.zeros(len(splat), device=splat.means.device)
-    for view in views[:: -(-len(views) // MAX_VIEWS)]:
-        feature = torch.zeros(len(splat), 1, device=most.device, requires_grad=True)
-        camera = view.viewmat[None].to(most.device), view.K[None].to(most.device)
+    total = torch.zeros(len(splat), device=splat.means.device)
+    views = views[:: -(-len(views) // MAX_VIEWS)]
+    for view in views:
+        feature = torch.zeros(len(splat), 1, device=total.device, requires_grad=True)
+        camera = view.viewmat[None].to(total.device), view.K[None].to(total.device)
         with torch.enable_grad():
             image = render(splat, *camera, view.width, view.height, features=feature, with_depth=False, sh_degree=0)
-            (gradient,) = torch.autograd.grad(image.features.sum(), feature)
-        most = torch.maximum(most, gradient[:, 0])
-    return most
+            total += torch.autograd.grad(image.features.sum(), feature)[0][:, 0]
+    return total / len(views)
+
+
+def shown(seen: Tensor, share: float = 0.98) -> Tensor:
+    """Which Gaussians [N] make up `share` of all visibility `seen` [N]; the others are as good as hidden."""
+    order = seen.argsort(descending=True)
+    enough = seen[order].cumsum(0) - seen[order] < share * seen.sum()
+    return torch.zeros_like(enough).scatter(0, order, enough)

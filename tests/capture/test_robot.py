@@ -132,7 +132,11 @@ def test_package_paths_are_found_above_the_urdf(tmp_path):
         ('joint name="hoist"', 'joint name="swing"', "two joints"),
         ('lower="0.5" upper="3"', 'lower="3" upper="0.5"', "exchange lower and upper"),
         ('joint="swing"', 'joint="mount"', "mimics 'mount'"),
-        ('<link name="flange"/>', '<xacro:flange xmlns:xacro="http://www.ros.org/wiki/xacro"/><link name="flange"/>', "xacro"),
+        (
+            '<link name="flange"/>',
+            '<xacro:flange xmlns:xacro="http://www.ros.org/wiki/xacro"/><link name="flange"/>',
+            "xacro",
+        ),
     ],
 )
 def test_a_broken_urdf_is_refused_with_a_reason(tmp_path, old, new, says):

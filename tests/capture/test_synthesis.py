@@ -7,7 +7,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from splatart_ns.capture.synthesis import SynthesisOptions, camera_poses, synthesize
+from splatart_ns.capture.formats import load_capture
+from splatart_ns.capture.scene import camera_poses
+from splatart_ns.capture.synthesis import SynthesisOptions, synthesize
 from splatart_ns.errors import InputError
 
 URDF = """<robot name="toy">
@@ -223,6 +225,13 @@ def test_a_robot_without_shapes_is_refused(tmp_path):
     path.write_text('<robot name="bare"><link name="base"/></robot>')
     with pytest.raises(InputError, match="nothing to render"):
         synthesize(path, tmp_path / "c", SMALL)
+
+
+def test_the_capture_reads_back_with_its_parts_and_unit(capture):
+    read_back = load_capture(capture)
+    assert read_back.parts == {1: "base", 2: "arm", 3: "finger"}
+    assert [len(s.split("train")) for s in read_back.states] == [6, 6]
+    assert read_back.length_unit == "metre"
 
 
 @pytest.mark.parametrize("views", ["sphere", "hemisphere"])

@@ -47,14 +47,14 @@ def test_an_object_that_fills_the_images_has_radius_one(capture_folder):
     assert view.width / 2 * distance / view.K[0, 0] == pytest.approx(1, rel=1e-5)
 
 
-def test_the_object_mask_comes_before_the_images_alpha(capture_folder, edit):
+def test_the_object_mask_cuts_off_what_else_the_images_alpha_shows(capture_folder, edit):
     mask = np.zeros((16, 16), np.uint8)
-    mask[:, :3] = 255
+    mask[:, :6] = 255
     cv2.imwrite(str(capture_folder / "state_00/o.png"), mask)
     edit(capture_folder / FILE, lambda m: m["frames"][0].update(object_mask_path="o.png"))
     first, second = load_views(load_capture(capture_folder), 0)[:2]
-    assert first.alpha.tolist() == mask.tolist()
-    assert second.alpha[6, 6] == 255 and second.alpha[0, 0] == 0
+    assert first.alpha[:, :7].tolist() == second.alpha[:, :7].tolist()  # the mask's edge is left to the alpha
+    assert second.alpha[6, 7] == 255 and not first.alpha[:, 7:].any()
 
 
 def test_the_loss_mask_is_every_pixel_that_is_not_black(capture_folder, edit):

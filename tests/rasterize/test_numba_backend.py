@@ -1,6 +1,8 @@
+import os
 from concurrent.futures import ThreadPoolExecutor
 
 import naive
+import numpy as np
 import pytest
 import torch
 from test_torch_backend import LEAVES, image_and_gradients, scene
@@ -8,6 +10,7 @@ from test_torch_backend import LEAVES, image_and_gradients, scene
 pytest.importorskip("numba")
 from splatart_ns.rasterize import torch_backend
 from splatart_ns.rasterize.numba_backend import rasterize_to_pixels
+from splatart_ns.rasterize.numba_runtime import jit, run
 
 
 @pytest.fixture
@@ -192,3 +195,25 @@ def test_arguments_may_be_views_without_contiguous_memory():
     image, gradients = image_and_gradients(strided, s, torch.float32)
     assert torch.equal(image, expected)
     assert all(map(torch.equal, gradients, expected_gradients))
+
+
+def test_kernels_compile_where_no_cache_can_be_kept():
+    names = {}
+    exec("def double(begin, end, worker, values): return 2 * values[begin:end].sum()", names)
+    assert run(jit(names["double"]), np.array([0, 2, 3]), np.arange(3.0)) == [2.0, 4.0]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_child_renders(num_threads):
+    num_threads(2)
+    s = scene(N=50)
+    image_and_gradients(rasterize_to_pixels, s, torch.float32)
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            image_and_gradients(rasterize_to_pixels, s, torch.float32)
+            status = 0
+        finally:
+            os._exit(status)
+    assert os.waitpid(child, 0)[1] == 0

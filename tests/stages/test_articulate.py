@@ -19,7 +19,7 @@ def joint(parent, child, kind, axis, origin, limits=(0.0, 1.0), pitch=0.0):
 
 
 def tree() -> KinematicTree:
-    """Base 4, arm 2 turning on it, tool 9 sliding on the arm, a lid 3 fixed to the tool, a cap 5 screwed on; 8 loose."""
+    """Base 4, arm 2 turning on it, tool 9 sliding on the arm, lid 3 fixed to the tool, cap 5 screwed on; 8 loose."""
     joints = [
         joint(4, 2, "revolute", [0, 0, 1], [1, 0, 0], (-1, 1)),
         joint(2, 9, "prismatic", [0, 1, 0], [0, 0, 0], (0, 0.5)),

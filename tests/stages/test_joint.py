@@ -30,7 +30,7 @@ class Scene:
         T = joint_motion(kind, self.axis, self.origin, pitch, torch.tensor(values, dtype=torch.float64))
         if noise > 0:
             about = from_rotation_translation(torch.eye(3, dtype=torch.float64), self.points.mean(0))
-            spread = torch.linalg.cholesky(surface_noise(self.points, noise, 0.005))
+            spread = torch.linalg.cholesky(surface_noise(self.points, noise, 1.0))
             error = about @ se3_exp((spread @ self.normal(len(values), 6, 1))[..., 0]) @ inverse(about)
             T = torch.cat([T[:1], (T @ error)[1:]])
         return T
@@ -102,7 +102,7 @@ def test_no_nearby_joint_fits_better():
     T = scene.motions("revolute", [0.0, 0.8, -0.6], noise=0.003)
     fit = fit_joint(T, scene.points, object_radius=1.0, noise=0.003)
     about = from_rotation_translation(torch.eye(3, dtype=torch.float64), scene.points.mean(0))
-    weight = torch.linalg.inv(surface_noise(scene.points, 0.003, 0.005))
+    weight = torch.linalg.inv(surface_noise(scene.points, 0.003, 1.0))
 
     def chi2(axis, origin, values):
         x = se3_log(inverse(about) @ inverse(joint_motion("revolute", axis, origin, 0.0, values)) @ T @ about)

@@ -1,4 +1,8 @@
-"""Spreading compiled kernels over threads."""
+"""Compiling kernels, and running them on threads.
+
+Kernels let go of the interpreter's lock and run in plain Python threads. Unlike numba's own threading layers these do
+not spin while torch's OpenMP threads work, and kernels may be started by several threads at once (viewer and training).
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
-
-# Kernels are compiled with nogil=True and run in plain Python threads: unlike numba's own threading layers these never
-# spin while torch's OpenMP threads work, and kernels may be started from several threads at once (viewer and training).
-# Sub-normal numbers are rounded as usual, and infinities keep their meaning: only reassociation and contraction.
-JIT = {"nogil": True, "cache": True, "fastmath": {"contract", "reassoc", "nsz", "arcp"}, "error_model": "numpy"}
+from numba import njit
 
 _pool: ThreadPoolExecutor | None = None
 
@@ -24,6 +24,15 @@ def _forget_pool() -> None:
 
 if hasattr(os, "register_at_fork"):  # a forked child has the pool object but not its threads
     os.register_at_fork(after_in_child=_forget_pool)
+
+
+def jit(function: Callable) -> Callable:
+    """Compiles a kernel, cached on disk where a folder can be written. Sums may be reordered; inf and nan are kept."""
+    options = {"nogil": True, "fastmath": {"contract", "reassoc", "nsz", "arcp"}, "error_model": "numpy"}
+    try:
+        return njit(cache=True, **options)(function)
+    except RuntimeError:  # numba finds no folder for its cache
+        return njit(**options)(function)
 
 
 def num_workers() -> int:

@@ -1,0 +1,90 @@
+"""Structural similarity of images, and the loss of Gaussian splatting made of it.
+
+Wang et al. 2004, "Image quality assessment: from error visibility to structural similarity": local means, variances
+and covariance under a Gaussian window (11 taps, sigma 1.5), only where the window lies inside the image.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from functools import cache
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+_TAPS, _SIGMA = 11, 1.5
+_C1, _C2 = 0.01**2, 0.03**2
+_HAS_NUMBA = importlib.util.find_spec("numba") is not None
+
+
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Mean structural similarity, a scalar, of images [H, W, 3] with values in [0, 1].
+
+    Differentiable in `image` only. Along a side shorter than the window, the window has the largest odd size that fits.
+    """
+    return _Similarity.apply(image, target, 0.0, 1.0)
+
+
+def l1_ssim_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+    """(1 - w) mean |image - target| + w (1 - ssim), a scalar, of images [H, W, 3] with values in [0, 1].
+
+    The loss of Kerbl et al. 2023. Differentiable in `image` only.
+    """
+    return ssim_weight + _Similarity.apply(image, target, 1 - ssim_weight, -ssim_weight)
+
+
+class _Similarity(torch.autograd.Function):
+    """l1_factor mean |image - target| + ssim_factor ssim; its gradient is made along with the value."""
+
+    @staticmethod
+    def forward(ctx, image, target, l1_factor, ssim_factor):
+        function = _value_and_gradient
+        if _HAS_NUMBA and image.device.type == "cpu" and image.dtype == torch.float32:
+            function = _value_and_gradient_numba
+        with_gradient = ctx.needs_input_grad[0]
+        value, gradient = function(image.detach(), target.detach().to(image), l1_factor, ssim_factor, with_gradient)
+        if with_gradient:
+            ctx.save_for_backward(gradient)
+        return value
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_value):
+        (gradient,) = ctx.saved_tensors
+        return gradient * v_value, None, None, None
+
+
+def _value_and_gradient_numba(image, target, l1_factor, ssim_factor, with_gradient):
+    from splatart_ns.rasterize.numba_ssim import ssim_and_gradient
+
+    windows = tuple(_window(size).float().numpy() for size in image.shape[:2])
+    factors = (ssim_factor, l1_factor) if with_gradient else None
+    value, gradient = ssim_and_gradient(image.contiguous().numpy(), target.contiguous().numpy(), windows, factors)
+    value = torch.tensor(ssim_factor * value)
+    if l1_factor:
+        value += l1_factor * (image - target).abs().mean()
+    return value, None if gradient is None else torch.from_numpy(gradient)
+
+
+def _value_and_gradient(image, target, l1_factor, ssim_factor, with_gradient):
+    with torch.set_grad_enabled(with_gradient):
+        x = image.clone().requires_grad_(with_gradient)
+        windows = [_window(size).to(image) for size in image.shape[:2]]
+        moments = torch.stack([x, target, x * x, target * target, x * target])
+        for axis, window in zip((1, 2), windows, strict=True):
+            moments = moments.unfold(axis, len(window), 1) @ window
+        mx, my, xx, yy, xy = moments
+        level = (2 * mx * my + _C1) / (mx * mx + my * my + _C1)
+        structure = (2 * (xy - mx * my) + _C2) / (xx - mx * mx + yy - my * my + _C2)
+        value = l1_factor * (x - target).abs().mean() + ssim_factor * (level * structure).mean()
+        gradient = torch.autograd.grad(value, x)[0] if with_gradient else None
+    return value.detach(), gradient
+
+
+@cache
+def _window(size: int) -> Tensor:
+    """Taps of the window along a side of `size` pixels, float64."""
+    taps = min(_TAPS, size - (size + 1) % 2)
+    weights = torch.exp(-0.5 * ((torch.arange(taps, dtype=torch.float64) - taps // 2) / _SIGMA) ** 2)
+    return weights / weights.sum()

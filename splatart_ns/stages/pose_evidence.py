@@ -1,0 +1,54 @@
+"""What the images say of finished poses: how certain they are, and which parts could as well only slide."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from splatart_ns.capture.view import View
+from splatart_ns.geometry.se3 import inverse, so3_log
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.part_pair import part_pair
+from splatart_ns.stages.refinement import motion_covariance, rotation_held_ratio
+from splatart_ns.stages.render_choice import FINE_PIXELS, VIEWS
+
+MAYBE_SLIDING = math.radians(10)
+"""A part that turned less than this against another may be sliding: thin parts' turns are known no better."""
+
+
+def motion_covariances(splats: Sequence[Splat], views: Sequence[Sequence[View]], T: Tensor) -> Tensor:
+    """Covariances [S, P, 6, 6] of the poses T [S, P, 4, 4]: T = se3_exp(xi) T_true, xi = (translation, rotation).
+
+    NaN for a part that no labelled view shows; 0 at state 0.
+    """
+    S, P = T.shape[:2]
+    out = torch.zeros(S, P, 6, 6, dtype=torch.float64, device=T.device)
+    for s in range(1, S):
+        for p in range(P):
+            pair = part_pair((splats[0], splats[s]), (views[0], views[s]), p + 1, VIEWS, FINE_PIXELS)
+            out[s, p] = torch.nan if pair is None else motion_covariance(pair, T[s, p])
+    return out
+
+
+def rotation_held_ratios(splats: Sequence[Splat], views: Sequence[Sequence[View]], T: Tensor) -> Tensor:
+    """How much worse part b's images fit when b may only slide against part a [P, P], row a, column b.
+
+    Measured at the state where b turned most against a; NaN where it turned more than `MAYBE_SLIDING` (it does not
+    slide), where b did not move against a, and where no labelled view shows b.
+    """
+    P = T.shape[1]
+    out = torch.full((P, P), torch.nan)
+    for b in range(P):
+        for a in range(P):
+            relative = inverse(T[:, a]) @ T[:, b]
+            angles = so3_log(relative[:, :3, :3]).norm(dim=-1)
+            s = int(angles.argmax())
+            if a == b or s == 0 or angles[s] > MAYBE_SLIDING:
+                continue
+            pair = part_pair((splats[0], splats[s]), (views[0], views[s]), b + 1, VIEWS, FINE_PIXELS)
+            if pair is not None:
+                out[a, b] = rotation_held_ratio(pair, T[s, b], T[s, a, :3, :3])
+    return out.to(T.device)

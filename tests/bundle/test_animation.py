@@ -1,0 +1,113 @@
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from splatart_ns.bundle.animation import part_colours, render_frames, write_frames
+from splatart_ns.bundle.viewpoint import Viewpoint, bounding_sphere, orbit_viewpoint
+from splatart_ns.errors import InputError
+
+FRAMES = [np.full((31, 41, 3), value, np.uint8) for value in (10, 128, 250)]
+
+
+@pytest.fixture
+def view(bundle):
+    return orbit_viewpoint(*bounding_sphere(bundle, [{}, {"hinge": 1.5}]), -1.2, 0.5, 48, 40)
+
+
+def test_a_joint_moves_what_hangs_on_it_alone(bundle, view):
+    base, door = bundle.parts[0].splat, bundle.parts[1:]
+    base.log_scales += 0.5
+    for part in door:
+        part.splat.opacity_logits[:] = -12.0
+    still, moved = render_frames(bundle, [{}, {"hinge": 1.5}], view)
+    assert still.shape == (40, 48, 3) and still.dtype == np.uint8
+    assert np.array_equal(still, moved) and (still < 255).any()
+    for part in door:
+        part.splat.opacity_logits[:] = 3.0
+    still, moved = render_frames(bundle, [{}, {"hinge": 1.5}], view)
+    assert not np.array_equal(still, moved)
+
+
+def test_the_background_is_the_colour_asked_for(bundle, view):
+    (frame,) = render_frames(bundle, [{}], view, background=(0.0, 0.2, 1.0))
+    assert frame[0, 0].tolist() == [0, 51, 255]
+
+
+def test_parts_have_their_colours(bundle, view):
+    for part in bundle.parts:
+        part.splat.log_scales += 0.7
+        part.splat.opacity_logits[:] = 8.0
+    (frame,) = render_frames(bundle, [{}], view, "parts", background=(0.0, 0.0, 0.0))
+    pixels = torch.from_numpy(frame).float().reshape(-1, 3) / 255
+    distances = torch.cdist(part_colours(bundle), pixels).amin(1)
+    assert (distances < 0.06).all()
+
+
+def test_accumulation_is_grey_and_depth_tells_near_from_far(bundle, view):
+    for part in bundle.parts:
+        part.splat.log_scales += 0.7
+    (accumulation,) = render_frames(bundle, [{}], view, "accumulation")
+    assert (accumulation[..., 0] == accumulation[..., 2]).all() and accumulation.max() > 200
+    (depth,) = render_frames(bundle, [{}], view, "depth", background=(0.0, 0.0, 0.0))
+    covered = accumulation[..., 0] > 200
+    assert len(np.unique(depth[covered], axis=0)) > 5
+
+
+@pytest.mark.parametrize("output", ["rgb", "depth", "accumulation", "parts"])
+def test_the_unit_of_length_does_not_matter(bundle, view, output):
+    def frame(scale):
+        for part in bundle.parts:
+            part.splat.means *= scale
+            part.splat.log_scales += np.log(scale)
+        T = view.T_world_camera.copy()
+        T[:3, 3] *= scale
+        return next(render_frames(bundle, [{}], Viewpoint(view.camera, T), output)).astype(int)
+
+    assert np.abs(frame(1.0) - frame(2.0**-10)).max() <= 2
+
+
+def test_pngs_replace_those_of_a_longer_run(tmp_path):
+    (tmp_path / "frame_0007.png").write_bytes(b"")
+    (tmp_path / "other.png").write_bytes(b"")
+    assert write_frames(iter(FRAMES), tmp_path) == 3
+    names = sorted(p.name for p in tmp_path.iterdir())
+    assert names == ["frame_0000.png", "frame_0001.png", "frame_0002.png", "other.png"]
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "frame_0001.png")), FRAMES[1])
+
+
+def test_a_gif_has_all_frames(tmp_path):
+    assert write_frames(iter(FRAMES), tmp_path / "new" / "a.gif", fps=10) == 3
+    with Image.open(tmp_path / "new" / "a.gif") as image:
+        assert image.n_frames == 3 and image.size == (41, 31) and image.info["duration"] == 100
+        image.seek(2)
+        assert abs(int(np.asarray(image.convert("RGB"))[0, 0, 0]) - 250) < 5
+
+
+def test_a_video_has_all_frames_and_an_even_size(tmp_path):
+    import imageio_ffmpeg
+
+    assert write_frames(iter(FRAMES), tmp_path / "a.mp4", fps=10) == 3
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
+    reader = imageio_ffmpeg.read_frames(str(tmp_path / "a.mp4"))
+    assert next(reader)["source_size"] == (42, 32)
+    values = [np.frombuffer(frame, np.uint8).mean() for frame in reader]
+    assert values == pytest.approx([10, 128, 250], abs=6)
+
+
+def test_a_run_that_dies_leaves_the_last_good_file(tmp_path):
+    def dying():
+        yield FRAMES[0]
+        raise RuntimeError("power cut")
+
+    for name in ("a.gif", "a.mp4"):
+        (tmp_path / name).write_bytes(b"good")
+        with pytest.raises(RuntimeError, match="power cut"):
+            write_frames(dying(), tmp_path / name)
+        assert (tmp_path / name).read_bytes() == b"good"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_other_formats_are_refused(tmp_path):
+    with pytest.raises(InputError, match="'.avi' cannot be written"):
+        write_frames(iter(FRAMES), tmp_path / "a.avi")

@@ -1,0 +1,98 @@
+import math
+
+import pytest
+
+from splatart_ns.bundle.configurations import movable_joints, parse_settings, read_trajectory, sweep
+from splatart_ns.errors import InputError
+
+
+def test_joints_with_one_value_are_movable_parents_first(bundle):
+    assert list(movable_joints(bundle)) == ["hinge", "slide"]
+    bundle.joints[0].type = "fixed"
+    assert list(movable_joints(bundle)) == ["hinge"]
+
+
+def test_values_are_radians_and_lengths_unless_degrees_are_asked_for(bundle):
+    assert parse_settings(["hinge=0.5", "slide=-1e-2"], bundle) == {"hinge": 0.5, "slide": -0.01}
+    assert parse_settings([" hinge = 90 deg "], bundle) == {"hinge": pytest.approx(math.pi / 2)}
+    assert parse_settings(["hinge=-90DEG"], bundle) == {"hinge": pytest.approx(-math.pi / 2)}
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["hinge"], "no '='"),
+        (["nobody=1"], "called 'nobody'; there are hinge, slide"),
+        (["closure=1"], "closure"),
+        (["hinge=1", "hinge=2"], "twice"),
+        (["hinge="], "no number"),
+        (["hinge=nan"], "no number"),
+        (["hinge=inf"], "no number"),
+        (["hinge=1rad"], "no number"),
+        (["hinge=deg"], "no number"),
+        (["slide=30deg"], "give a length"),
+    ],
+)
+def test_a_setting_that_cannot_be_used_says_why(bundle, settings, message):
+    with pytest.raises(InputError, match=message):
+        parse_settings(settings, bundle)
+
+
+def test_a_sweep_goes_there_and_back_one_joint_after_the_other(bundle):
+    frames = sweep(bundle, {}, 8)
+    assert len(frames) == 16
+    hinge = [q.get("hinge", 0.0) for q in frames]
+    slide = [q.get("slide", 0.0) for q in frames]
+    assert hinge[0] == pytest.approx(0) and hinge[4] == pytest.approx(math.pi / 2)
+    assert hinge[1:4] == pytest.approx(hinge[7:4:-1])
+    assert hinge[8:] == [0.0] * 8 and slide[:8] == [0.0] * 8
+    assert slide[8] == pytest.approx(0) and min(slide) == pytest.approx(-0.25) and max(slide) <= 1e-12
+
+
+def test_a_sweep_starts_where_the_joint_is_set_and_keeps_the_others(bundle):
+    frames = sweep(bundle, {"hinge": 0.3, "slide": -0.1}, 20)
+    assert frames[0] == {"hinge": pytest.approx(0.3), "slide": -0.1}
+    assert frames[20] == {"hinge": 0.3, "slide": pytest.approx(-0.1)}
+    assert max(q["hinge"] for q in frames) == pytest.approx(math.pi / 2, abs=0.05)
+
+
+def test_a_sweep_of_joints_that_did_not_move_is_one_frame(bundle):
+    for joint in bundle.joints:
+        joint.limits = (0.0, 0.0)
+    assert sweep(bundle, {"hinge": 0.3}, 8) == [{"hinge": 0.3}]
+
+
+def test_a_trajectory_has_a_row_a_frame(bundle, tmp_path):
+    path = tmp_path / "q.csv"
+    path.write_text("\ufeffslide, hinge\n-0.1,45deg\n\n0,1.5\r\n", encoding="utf-8")
+    assert read_trajectory(path, bundle) == [
+        {"slide": -0.1, "hinge": pytest.approx(math.pi / 4)},
+        {"slide": 0.0, "hinge": 1.5},
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"", "has 0 lines"),
+        (b"hinge\n", "has 1 lines"),
+        (b"hinge,nobody\n1,2\n", "nobody"),
+        (b"hinge,hinge\n1,2\n", "twice"),
+        (b"hinge,slide\n1\n", "line 2 has 1 values"),
+        (b"hinge\n1\n1,2\n", "line 3 has 2 values"),
+        (b"hinge\n1\n\nx\n", "line 4: 'x'"),
+        (b"hinge,slide\n1,\n", "line 2: ''"),
+        (b"\xff\xfe\x00", "CSV"),
+    ],
+)
+def test_a_trajectory_that_cannot_be_used_says_why(bundle, tmp_path, text, message):
+    path = tmp_path / "q.csv"
+    path.write_bytes(text)
+    with pytest.raises(InputError, match=message) as error:
+        read_trajectory(path, bundle)
+    assert str(path) in str(error.value)
+
+
+def test_a_missing_trajectory_is_named(bundle, tmp_path):
+    with pytest.raises(InputError, match="none.csv"):
+        read_trajectory(tmp_path / "none.csv", bundle)

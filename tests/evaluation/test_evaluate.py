@@ -1,0 +1,92 @@
+import io
+import json
+import shutil
+
+import pytest
+from rich.console import Console
+
+from splatart_ns.bundle import save_bundle
+from splatart_ns.errors import InputError
+from splatart_ns.evaluation import evaluate, format_tables
+
+
+@pytest.fixture
+def folder(bundle, tmp_path):
+    save_bundle(bundle, tmp_path / "out")
+    return tmp_path / "out"
+
+
+def printed(metrics) -> str:
+    console = Console(width=200, record=True, file=io.StringIO())
+    for item in format_tables(metrics):
+        console.print(item)
+    return console.export_text()
+
+
+def test_a_perfect_estimate_scores_perfectly(folder, capture):
+    (folder / "report.json").write_text('{"stages": {"semantic": {"seconds": 1.5}}}')
+    metrics = evaluate(folder, capture)
+    assert list(metrics) == ["joints", "joints_mean", "structure", "parts", "geometry", "images", "speed", "notes"]
+    assert metrics["structure"] == {"tree_exact": True, "edges_precision": 1.0, "edges_recall": 1.0}
+    for kind in ("revolute", "prismatic"):
+        assert metrics["joints_mean"][kind]["displacement"] == pytest.approx(0, abs=1e-6)
+    assert metrics["parts"][0]["part_rotation"] == pytest.approx(0, abs=1e-5)
+    assert metrics["geometry"]["mesh"] is None
+    assert metrics["geometry"]["centres"]["CD-w"] == pytest.approx(0, abs=1e-6)
+    assert list(metrics["images"]) == ["state_00", "state_01", "novel_00"]
+    for scores in metrics["images"].values():
+        assert scores["psnr"] > 45
+        assert scores["ssim"] > 0.995
+        assert scores["lpips"] is None
+        assert scores["accumulation_l1"] < 0.005
+        assert scores["part_iou"] > 0.98
+    assert metrics["speed"] == {"stages": {"semantic": {"seconds": 1.5}}}
+    assert json.loads((folder / "metrics.json").read_text())["joints"] == metrics["joints"]
+
+
+def test_a_wrong_motion_shows_in_the_images_of_its_state(bundle, folder, capture):
+    bundle.parts[2].motion[1, :3, 3] += 0.3
+    save_bundle(bundle, folder)
+    images = evaluate(folder, capture)["images"]
+    assert images["state_00"]["psnr"] > 45 and images["novel_00"]["psnr"] > 45
+    assert images["state_01"]["psnr"] < 30
+    assert images["state_01"]["part_iou"] < 0.9
+
+
+def test_without_ground_truth_there_are_image_scores_alone(folder, capture, tmp_path):
+    plain = shutil.copytree(capture, tmp_path / "plain")
+    (plain / "ground_truth.json").unlink()
+    metrics = evaluate(folder, plain)
+    assert metrics["joints"] == [] and metrics["structure"] == {}
+    assert list(metrics["images"]) == ["state_00", "state_01"]
+    assert any("no ground_truth.json" in note for note in metrics["notes"])
+    assert any("novel_00" in note for note in metrics["notes"])
+    assert "PSNR" in printed(metrics) and "Joints" not in printed(metrics)
+
+
+def test_a_missing_part_counts_against_the_part_iou(bundle, folder, capture):
+    bundle.parts.pop(2)
+    bundle.joints.pop(1)
+    save_bundle(bundle, folder)
+    metrics = evaluate(folder, capture)
+    assert metrics["images"]["state_00"]["part_iou"] < 0.7
+    assert metrics["joints"][1]["axis_angle"] is None
+    assert metrics["structure"]["edges_recall"] == 0.5
+    assert any("slide" in note for note in metrics["notes"])
+
+
+def test_a_bundle_of_another_capture_is_refused(bundle, folder, capture):
+    for part in bundle.parts:
+        part.motion, part.motion_covariance = part.motion[:1], part.motion_covariance[:1]
+    for joint in bundle.joints:
+        joint.values = joint.values[:1]
+    bundle.states = ["state_00"]
+    save_bundle(bundle, folder)
+    with pytest.raises(InputError, match="1 states"):
+        evaluate(folder, capture)
+
+
+def test_the_tables_show_every_joint_and_configuration(folder, capture):
+    text = printed(evaluate(folder, capture))
+    for word in ("body - door", "door - latch", "state_01", "novel_00", "tree_exact: yes", "note: speed"):
+        assert word in text

@@ -1,0 +1,85 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from splatart_ns.bundle import configured_motions, normalized, observed_motions
+from splatart_ns.capture.capture import Capture, Normalization
+from splatart_ns.capture.view import View
+from splatart_ns.evaluation.images import image_scores, is_mapped, mapped_value, novel_motions, part_overlap, psnr
+
+D = torch.float64
+
+
+def test_psnr_of_a_tenth_is_20():
+    assert psnr(torch.full((4, 4, 3), 0.6), torch.full((4, 4, 3), 0.5)) == pytest.approx(20, abs=1e-4)
+    assert psnr(torch.ones(2, 2, 3), torch.ones(2, 2, 3)) == math.inf
+
+
+def test_unlabelled_pixels_do_not_count():
+    ids = torch.tensor([[1, 1, 2, 2]])
+    labels = torch.tensor([[1, 255, 255, 1]])
+    assert part_overlap(ids, labels, [1, 2, 3]).tolist() == [[1, 2], [0, 1], [0, 0]]
+
+
+def test_a_splat_is_brought_to_the_normalised_world(bundle):
+    splat = bundle.parts[0].splat
+    out = normalized(splat, Normalization(np.array([1.0, 2.0, 3.0]), 0.5))
+    torch.testing.assert_close(out.means, 0.5 * (splat.means - torch.tensor([1.0, 2.0, 3.0])))
+    torch.testing.assert_close(out.scales, 0.5 * splat.scales)
+
+
+def test_views_without_silhouettes_and_labels_score_null_and_say_so(bundle, tmp_path):
+    view = View("v", torch.eye(4), torch.eye(3), 2, 2, torch.zeros(2, 2, 3, dtype=torch.uint8))
+    scores, notes = image_scores(bundle, observed_motions(bundle, 0), [view], Capture(tmp_path, (), {}))
+    assert set(scores.values()) == {None}
+    assert len(notes) == 2
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_true_change_takes_the_sign_of_the_estimate(truth, bundle, sign):
+    bundle.joints[0].values *= sign
+    assert float(mapped_value(bundle.joints[0], truth.joints[0], 0.2)) == pytest.approx(sign * 0.2)
+
+
+def test_another_type_goes_as_far_along_its_own_travel(truth, bundle):
+    bundle.joints[0].type = "free"
+    bundle.joints[0].values = torch.tensor([[0.0] * 6, [1.0, 2, 3, 4, 5, 6]], dtype=D)
+    value = mapped_value(bundle.joints[0], truth.joints[0], 0.25)
+    torch.testing.assert_close(value, torch.tensor([0.5, 1, 1.5, 2, 2.5, 3], dtype=D))
+
+
+def test_a_joint_that_did_not_move_stays(truth, bundle):
+    truth.joints[0].values.zero_()
+    assert float(mapped_value(bundle.joints[0], truth.joints[0], 0.25)) == 0
+
+
+@pytest.mark.parametrize("flip", ["axis", "direction", "nothing"])
+def test_a_perfect_estimate_goes_where_the_truth_goes(truth, bundle, flip):
+    if flip == "axis":
+        for joint in bundle.joints:
+            joint.axis, joint.values = -joint.axis, -joint.values
+    if flip == "direction":
+        # The same object with the door as the root: the world moves with the door.
+        hinge = bundle.joints[0]
+        hinge.parent, hinge.child, hinge.values = "door", "body", -hinge.values
+        bundle.root = "door"
+    motions = novel_motions(bundle, truth, truth.novel[0])
+    for part in bundle.parts:
+        torch.testing.assert_close(motions[part.name], truth.novel[0].motions[part.id])
+
+
+def test_the_root_moves_as_the_truth_says(truth, bundle):
+    G = torch.eye(4, dtype=D)
+    G[:3, 3] = torch.tensor([1.0, 2, 3])
+    truth.novel[0].motions[1] = G
+    q = {"hinge": 0.2, "slide": 0.1}
+    for name, T in novel_motions(bundle, truth, truth.novel[0]).items():
+        torch.testing.assert_close(T, G @ configured_motions(bundle, q)[name])
+
+
+def test_joints_of_another_kind_are_not_mapped_exactly(truth, bundle):
+    assert is_mapped(bundle, truth)
+    bundle.joints[1].parent = "body"
+    assert not is_mapped(bundle, truth)

@@ -1,0 +1,232 @@
+import math
+
+import pytest
+import torch
+
+from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp, transform_points
+from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
+from splatart_ns.stages.contact import find_contacts
+from splatart_ns.stages.joint import JointFit
+from splatart_ns.stages.tree import choose_root, fit_pairs, infer_tree, object_radius
+
+Z, X, Y = (torch.tensor(v, dtype=torch.float64) for v in ((0, 0, 1.0), (1.0, 0, 0), (0, 1.0, 0)))
+
+
+def box(centre, size, seed, count=400):
+    x = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.tensor(centre).double() + (x - 0.5) * torch.tensor(size).double()
+
+
+def rod(start, end, width, seed, count=400):
+    """Points in a cylinder-like bar between two places, reaching a little beyond both."""
+    start, end = torch.as_tensor(start).double(), torch.as_tensor(end).double()
+    generator = torch.Generator().manual_seed(seed)
+    along = torch.rand(count, 1, generator=generator, dtype=torch.float64) * 1.1 - 0.05
+    return (
+        start + along * (end - start) + width * (torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5)
+    )
+
+
+def motions_of(tree: KinematicTree, q: torch.Tensor, points: dict | None = None, seed=0, rotation=0.0, translation=0.0):
+    """Motions by part at configurations [S, J], with errors about the centroids if asked: radians and length."""
+    generator = torch.Generator().manual_seed(seed)
+    motions = {}
+    for k, part in enumerate(tree.part_ids):
+        T = forward_kinematics(tree, q)[:, k]
+        if rotation > 0 and part != tree.root:
+            about = from_rotation_translation(torch.eye(3, dtype=torch.float64), points[part].mean(0))
+            way = torch.nn.functional.normalize(torch.randn(len(q), 2, 3, generator=generator).double(), dim=-1)
+            error = about @ se3_exp(torch.cat([translation * way[:, 0], rotation * way[:, 1]], -1)) @ inverse(about)
+            T = torch.cat([T[:1], (T @ error)[1:]])
+        motions[part] = T
+    return motions
+
+
+def true_joint(parent, child, kind, axis, origin):
+    axis, origin = torch.as_tensor(axis).double(), torch.as_tensor(origin).double()
+    return Joint(parent, child, JointFit(kind, axis / torch.linalg.vector_norm(axis), origin, 0.0, torch.zeros(2), 0.0))
+
+
+def edges(tree: KinematicTree) -> set[tuple[int, int]]:
+    return {(j.parent, j.child) for j in tree.joints}
+
+
+def arm():
+    """Seven turning joints in a row and two sliding fingers, as a robot arm has them."""
+    places = [
+        (0, 0, 0),
+        (0, 0, 0.3),
+        (0.1, 0, 0.6),
+        (0.1, 0, 0.9),
+        (0.35, 0, 1.0),
+        (0.6, 0, 1.0),
+        (0.7, 0, 0.8),
+        (0.7, 0, 0.6),
+    ]
+    axes = [(0, 0, 1), (0, 1, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    points = {1: box((0, 0, -0.1), (0.3, 0.3, 0.2), 1)}
+    for k in range(7):
+        points[k + 2] = rod(places[k], places[k + 1], 0.1, k + 2)
+    points[8] = torch.cat([points[8], box((0.7, 0, 0.57), (0.06, 0.25, 0.06), 20)])
+    for part, side in ((9, 1), (10, -1)):
+        points[part] = box((0.7, 0.06 * side, 0.5), (0.03, 0.02, 0.09), part)
+    joints = [true_joint(k + 1, k + 2, "revolute", axes[k], places[k]) for k in range(7)]
+    joints += [true_joint(8, part, "prismatic", (0, side, 0), (0.7, 0, 0.5)) for part, side in ((9, 1), (10, -1))]
+    return points, KinematicTree(sorted(points), 1, joints)
+
+
+ARM_CHANGE = [0.5, 0.45, -0.4, 0.55, -0.5, 0.5, 0.7, 0.05, 0.04]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_an_arm_of_seven_turns_and_two_slides_from_two_noisy_states(seed):
+    points, truth = arm()
+    q = torch.tensor([[0.0] * 9, ARM_CHANGE], dtype=torch.float64)
+    radius = object_radius(points)
+    motions = motions_of(truth, q, points, seed, math.radians(0.3), 0.003 * radius)
+    tree = infer_tree(points, motions)
+    assert tree.root == 1 and edges(tree) == edges(truth)
+    assert {j.child: j.fit.type for j in tree.joints} == {j.child: j.fit.type for j in truth.joints}
+    assert not tree.loops and not tree.unattached
+    # Contact was needed: some false pair moves like a joint, too.
+    assert tree.rejected
+    for joint in tree.joints:
+        true = next(j for j in truth.joints if j.child == joint.child)
+        if joint.fit.type == "revolute":
+            assert float((joint.fit.axis @ true.fit.axis).abs()) > math.cos(math.radians(4))
+        assert abs(float(joint.fit.values[1])) == pytest.approx(abs(ARM_CHANGE[joint.child - 2]), abs=0.03)
+
+
+def test_two_states_leave_a_planar_chain_to_contact():
+    """With parallel axes any two links move like a joint; only touch tells which are neighbours."""
+    points = {k: rod((k, 0, 0), (k + 1, 0, 0), 0.1, k) for k in range(1, 5)}
+    truth = KinematicTree([1, 2, 3, 4], 1, [true_joint(k, k + 1, "revolute", Z, (k + 1, 0, 0)) for k in (1, 2, 3)])
+    q = torch.tensor([[0, 0, 0], [0.4, 0.5, 0.3]], dtype=torch.float64)
+    motions = motions_of(truth, q)
+    fits = fit_pairs(points, motions, object_radius(points))
+    assert all(f.residual < 1e-9 and f.type == "revolute" for f in fits.values())
+    tree = infer_tree(points, motions)
+    assert edges(tree) == edges(truth) and not tree.loops
+    assert len(tree.rejected) == 3
+
+
+def drawers(states):
+    points = {
+        1: torch.cat(
+            [box((0, y, 0), (1, 0.05, 2), k) for k, y in enumerate((-0.5, 0.5))] + [box((0, 0, 0), (1, 1, 0.05), 8)]
+        ),
+        2: box((0, 0, 0.5), (0.95, 0.9, 0.9), 5),
+        3: box((0, 0, -0.5), (0.95, 0.9, 0.9), 6),
+    }
+    truth = KinematicTree([1, 2, 3], 1, [true_joint(1, k, "prismatic", X, (0, 0, 0)) for k in (2, 3)])
+    return points, truth, torch.tensor([[0.0, 0.0], [0.5, 0.2], [0.1, 0.6], [0.3, 0.0]], dtype=torch.float64)[:states]
+
+
+@pytest.mark.parametrize("states", [2, 4])
+def test_two_drawers_hang_on_the_body_and_close_no_loop(states):
+    """They slide along each other, side by side, in every configuration."""
+    points, truth, q = drawers(states)
+    tree = infer_tree(points, motions_of(truth, q))
+    assert edges(tree) == {(1, 2), (1, 3)} and all(j.fit.type == "prismatic" for j in tree.joints)
+    assert not tree.loops and [{j.parent, j.child} for j in tree.rejected] == [{2, 3}]
+
+
+def test_more_states_reject_more_false_pairs():
+    points, truth = arm()
+    generator = torch.Generator().manual_seed(3)
+    factors = 3 * torch.rand(4, 9, generator=generator, dtype=torch.float64) - 1.5
+    q = torch.cat([torch.zeros(1, 9, dtype=torch.float64), factors * torch.tensor(ARM_CHANGE, dtype=torch.float64)])
+    radius = object_radius(points)
+    noise = {"points": points, "rotation": math.radians(0.3), "translation": 0.003 * radius}
+    five, two = (infer_tree(points, motions_of(truth, q[:n], **noise)) for n in (5, 2))
+    assert edges(five) == edges(truth) and len(five.rejected) < len(two.rejected)
+
+
+def four_bar(angles):
+    """A linkage of ground 1, crank 2, coupler 3, rocker 4: joints in A (1-2), B (2-3), C (3-4), D (4-1)."""
+    a, b, c, d = 1.0, 2.5, 2.0, 3.0
+    placed = []
+    for angle in angles:
+        A, D = torch.tensor([0.0, 0, 0]).double(), torch.tensor([d, 0, 0]).double()
+        B = A + a * torch.tensor([math.cos(angle), math.sin(angle), 0]).double()
+        reach = D - B
+        length = float(torch.linalg.vector_norm(reach))
+        along = (b**2 - c**2 + length**2) / (2 * length)
+        across = torch.linalg.cross(Z, reach / length)
+        placed.append((A, B, B + along * reach / length + math.sqrt(b**2 - along**2) * across, D))
+
+    def pose(p, q):
+        x = (q - p) / torch.linalg.vector_norm(q - p)
+        return from_rotation_translation(torch.stack([x, torch.linalg.cross(Z, x), Z], -1), p)
+
+    poses = [torch.stack([pose(s[i], s[j]) for s in placed]) for i, j in ((0, 3), (0, 1), (1, 2), (3, 2))]
+    motions = {k + 1: T @ inverse(T[0]) for k, T in enumerate(poses)}
+    A, B, C, D = placed[0]
+    points = {k: rod(*ends, 0.2, k) for k, ends in {1: (A, D), 2: (A, B), 3: (B, C), 4: (D, C)}.items()}
+    return points, motions
+
+
+def test_a_linkage_has_a_tree_and_one_loop():
+    tree = infer_tree(*four_bar([0.6, 1.2, 2.0, 2.9]))
+    ring = [{1, 2}, {2, 3}, {3, 4}, {1, 4}]
+    assert tree.root == 1 and len(tree.joints) == 3 and len(tree.loops) == 1
+    assert all({j.parent, j.child} in ring for j in tree.joints + tree.loops)
+
+
+def test_a_part_that_no_joint_explains_is_left_out_with_the_reason():
+    points, truth, q = drawers(2)
+    motions = motions_of(truth, q)
+    points[7] = box((0, 3, 0), (0.5, 0.5, 0.5), 9)
+    thrown = se3_exp(torch.tensor([0.2, 0.1, 1.5, 0, 0, 1.0], dtype=torch.float64))
+    motions[7] = torch.stack([torch.eye(4, dtype=torch.float64), thrown])
+    tree = infer_tree(points, motions, root=1)
+    assert edges(tree) == {(1, 2), (1, 3)} and list(tree.unattached) == [7]
+    assert "part 7" in tree.unattached[7] and "of the object's radius" in tree.unattached[7]
+
+
+def test_parts_that_stay_together_are_fixed():
+    points = {1: box((0, 0, 0), (1, 1, 1), 1), 2: box((0, 0, 0.6), (1, 1, 0.2), 2)}
+    still = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    tree = infer_tree(points, {1: still, 2: still})
+    assert edges(tree) == {(1, 2)} and tree.joints[0].fit.type == "fixed" and not tree.movable
+
+
+def test_the_root_is_the_largest_part_that_stood_still():
+    points = {1: box((0, 0, 0), (0.2, 0.2, 0.2), 1), 2: box((0, 0, 1), (2, 2, 1), 2), 3: box((0, 0, 2), (5, 5, 1), 3)}
+    still = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    moved = still.clone()
+    moved[1, 0, 3] = 2.0
+    assert choose_root(points, {1: still, 2: still, 3: moved}, 3.0) == 2
+    nudged = still.clone()
+    nudged[1, 0, 3] = 1.0
+    assert choose_root(points, {1: nudged, 2: moved, 3: moved}, 3.0) == 1
+
+
+def test_the_given_root_decides_which_way_joints_point():
+    points, truth, q = drawers(2)
+    motions = motions_of(truth, q)
+    tree = infer_tree(points, motions, root=2)
+    assert edges(tree) == {(2, 1), (1, 3)}
+    # Whatever the root, the tree reproduces the relative motions it was fitted to.
+    T = dict(
+        zip(tree.part_ids, forward_kinematics(tree, tree.observed(), root_motion=motions[2]).unbind(1), strict=True)
+    )
+    for part in points:
+        assert torch.allclose(
+            transform_points(T[part], points[part]), transform_points(motions[part], points[part]), atol=1e-9
+        )
+
+
+def test_a_single_part_is_its_own_tree():
+    tree = infer_tree({3: box((0, 0, 0), (1, 1, 1), 0)}, {3: torch.eye(4).repeat(2, 1, 1)})
+    assert tree.root == 3 and tree.joints == [] and tree.observed().shape == (1, 0)
+
+
+def test_rendering_ratios_and_covariances_reach_the_fits():
+    points, truth, q = drawers(2)
+    motions = motions_of(truth, q)
+    turned = fit_pairs(points, motions, 1.0, render_ratios={(2, 1): 5.0})
+    assert turned[1, 2].type == turned[2, 1].type == "revolute" and turned[1, 3].type == "prismatic"
+    loose = {p: torch.eye(6, dtype=torch.float64).repeat(2, 1, 1) for p in points}
+    assert fit_pairs(points, motions, 1.0, covariances=loose)[1, 2].type == "fixed"
+    assert set(find_contacts(points, motions)) == {(1, 2), (1, 3), (2, 3)}
