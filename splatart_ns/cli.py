@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
+import shutil
 import sys
+import warnings
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,15 +16,18 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import tyro
 from rich.console import Console
 
+from splatart_ns.capture.procedural import OBJECTS
+from splatart_ns.capture.synthesis import SynthesisOptions
 from splatart_ns.errors import InputError
 
 CONSOLE = Console()
+Quality = Literal["draft", "standard", "high"]
 
 
 def fit(
     capture: Annotated[Path, tyro.conf.Positional],
     output_dir: Path,
-    quality: Literal["draft", "standard", "high"] = "standard",
+    quality: Quality = "standard",
     root: str | None = None,
     seed: int = 0,
 ) -> None:
@@ -36,7 +42,62 @@ def fit(
     """
     from splatart_ns.plugin.fit import fit as run
 
-    run(capture, output_dir, quality=quality, root=root, seed=seed)
+    CONSOLE.print(f"Bundle: {run(capture, output_dir, quality, root, seed)}")
+
+
+def render(
+    bundle: Annotated[Path, tyro.conf.Positional],
+    output: Path,
+    set: tuple[str, ...] = (),
+    sweep: bool = False,
+    trajectory: Path | None = None,
+    channel: Literal["rgb", "depth", "accumulation", "parts"] = "rgb",
+    frames: int = 60,
+    fps: float = 30.0,
+    resolution: int = 512,
+    azimuth: float | None = None,
+    elevation: float = 25.0,
+    data: Path | None = None,
+    camera: int = 0,
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> None:
+    """Render a bundle in one configuration, in a sweep of each joint, or along a trajectory.
+
+    Args:
+        bundle: Folder that `splatart fit` left.
+        output: A folder for PNG frames, or a .gif or .mp4 file.
+        set: Joint values, joint=value: radians, or degrees as 30deg, or a length. Joints not named are as in state 0.
+        sweep: Move one joint after the other over its observed range.
+        trajectory: CSV file: a header of joint names, and a row of values a frame.
+        channel: What to show.
+        frames: Frames of each joint's sweep.
+        fps: Frames per second of a film.
+        resolution: Pixels along each side.
+        azimuth: Degrees of the camera about z; by default it faces the moving parts.
+        elevation: Degrees of the camera above the xy plane.
+        data: Folder of the capture, to look through one of its cameras instead.
+        camera: Number of that camera in state 0.
+        background: Colour behind the object, 0 to 1.
+    """
+    from splatart_ns.bundle import animation, configurations, load_bundle, viewpoint
+    from splatart_ns.capture.formats import load_capture
+
+    if sweep and trajectory is not None:
+        raise InputError("--sweep and --trajectory are both given; choose one.")
+    loaded = load_bundle(bundle)
+    base = configurations.parse_settings(set, loaded)
+    if trajectory is not None:
+        path = [base | q for q in configurations.read_trajectory(trajectory, loaded)]
+    else:
+        path = configurations.sweep(loaded, base, frames) if sweep else [base]
+    if data is not None:
+        view = viewpoint.capture_viewpoint(load_capture(data), camera)
+    else:
+        turn = viewpoint.front_azimuth(loaded) + math.radians(40) if azimuth is None else math.radians(azimuth)
+        sphere = viewpoint.bounding_sphere(loaded, path)
+        view = viewpoint.orbit_viewpoint(*sphere, turn, math.radians(elevation), resolution, resolution)
+    images = animation.render_frames(loaded, path, view, channel, background, _device())
+    CONSOLE.print(f"{animation.write_frames(images, output, fps)} frames: {output}")
 
 
 def evaluate(bundle: Annotated[Path, tyro.conf.Positional], data: Path) -> None:
@@ -49,7 +110,7 @@ def evaluate(bundle: Annotated[Path, tyro.conf.Positional], data: Path) -> None:
     from splatart_ns.evaluation.evaluate import evaluate as run
     from splatart_ns.evaluation.tables import format_tables
 
-    for table in format_tables(run(bundle, data)):
+    for table in format_tables(run(bundle, data, _device())):
         CONSOLE.print(table)
 
 
@@ -63,23 +124,75 @@ def check(capture: Annotated[Path, tyro.conf.Positional]) -> None:
 
     problems = check_capture(capture)
     for problem in problems:
-        CONSOLE.print(
-            f"[bold]{problem.severity}[/bold] {problem.file}: {problem.message} {problem.mend}", soft_wrap=True
-        )
+        print(f"{problem.severity}: {problem}")
     errors = sum(problem.severity == "error" for problem in problems)
-    CONSOLE.print(f"{errors} errors, {len(problems) - errors} warnings")
+    print(f"{errors} errors, {len(problems) - errors} warnings")
     if errors:
         raise SystemExit(2)
 
 
+def synth(
+    robot: Annotated[Path, tyro.conf.Positional],
+    output_dir: Path,
+    options: Annotated[SynthesisOptions, tyro.conf.arg(name="")],
+) -> None:
+    """Render a capture with ground truth from any URDF.
+
+    Args:
+        robot: The URDF file, or the name of a built-in object (see `splatart demo`).
+        output_dir: A folder that does not exist yet, or is empty.
+        options: How it is rendered.
+    """
+    from splatart_ns.capture.procedural import synthesize_object
+    from splatart_ns.capture.synthesis import synthesize
+
+    if str(robot) in OBJECTS and not robot.exists():
+        synthesize_object(str(robot), output_dir, options)
+    else:
+        synthesize(robot, output_dir, options)
+    CONSOLE.print(f"Capture: {output_dir}")
+
+
+def demo(output_dir: Path = Path("demo"), object: Literal[OBJECTS] = "hinge", quality: Quality = "draft") -> None:
+    """Make a capture of a built-in object, fit it, compare it with the truth and render a sweep. No download.
+
+    Args:
+        output_dir: Folder for the capture, the bundle and the film.
+        object: The built-in object.
+        quality: Of the fit.
+    """
+    from splatart_ns.capture.procedural import synthesize_object
+
+    capture, bundle = output_dir / "capture", output_dir / "bundle"
+    if not (capture / "ground_truth.json").exists():
+        shutil.rmtree(capture, ignore_errors=True)
+        options = SynthesisOptions(train_views=30, resolution=192)
+        CONSOLE.print(f"Rendering a capture of the built-in {object} ...")
+        synthesize_object(object, capture, options)
+    fit(capture, bundle, quality)
+    evaluate(bundle, capture)
+    render(bundle, output_dir / "sweep.gif", sweep=True, frames=40, fps=20, resolution=256)
+    CONSOLE.print(f"Look at {output_dir / 'sweep.gif'}; the bundle is {bundle}")
+
+
+def _device() -> str:
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
 def main() -> None:
     """Run the command line. A user's mistake gets one sentence and exit code 2."""
-    commands = {"fit": fit, "eval": evaluate, "check": check}
+    # Nerfstudio's own, which its users cannot mend.
+    warnings.filterwarnings("ignore", category=FutureWarning)
+    warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True")
+    commands = {"fit": fit, "render": render, "eval": evaluate, "check": check, "synth": synth, "demo": demo}
     try:
-        tyro.extras.subcommand_cli_from_dict(commands, prog="splatart")
+        tyro.extras.subcommand_cli_from_dict(commands, prog="splatart", description=__doc__)
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
+        message = str(error)
+        print(f"error: {message}" + ("" if message.endswith(".") else "."), file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+        print("Interrupted. The same command goes on after the last finished stage.", file=sys.stderr)
         raise SystemExit(130) from None

@@ -5,20 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 from rich.table import Table
+from rich.text import Text
 
 _JOINT_COLUMNS = {
-    "axis_angle": "axis angle\n[deg]",
-    "axis_position": "axis position\n[0.1 length]",
-    "pivot_offset": "pivot offset\n[length]",
-    "motion_geodesic": "motion\n[deg | length]",
-    "motion_value": "travel\n[deg | length]",
-    "displacement": "displacement\n[length]",
-    "displacement_percent": "displacement\n[% of radius]",
+    "axis_angle": "axis angle\n(deg)",
+    "axis_position": "axis position\n(0.1 length)",
+    "pivot_offset": "pivot offset\n(length)",
+    "motion_geodesic": "motion\n(deg | length)",
+    "motion_value": "travel\n(deg | length)",
+    "displacement": "displacement\n(length)",
+    "displacement_percent": "displacement\n(% of radius)",
     "covered_95": "in 95 %\nregion",
 }
-_PART_COLUMNS = {"part_rotation": "rotation\n[deg]", "part_translation": "translation\n[length]"}
+_PART_COLUMNS = {"part_rotation": "rotation\n(deg)", "part_translation": "translation\n(length)"}
 _IMAGE_COLUMNS = {
-    "psnr": "PSNR\n[dB]",
+    "psnr": "PSNR\n(dB)",
     "ssim": "SSIM\n",
     "lpips": "LPIPS\n",
     "accumulation_l1": "accumulation\nL1",
@@ -27,10 +28,14 @@ _IMAGE_COLUMNS = {
 _CHAMFER_COLUMNS = {"CD-s": "CD-s", "CD-m": "CD-m", "CD-w": "CD-w"}
 
 
-def format_tables(metrics: dict[str, Any]) -> list[Table | str]:
+def format_tables(metrics: dict[str, Any]) -> list[Table | Text]:
     """Everything in `metrics` for rich to print, one item after the other; tables without rows are left out."""
     joints = [
-        (f"{j['parent']} - {j['child']}", f"{j['type']}{'' if j['type_correct'] else ' (wrong)'}", j)
+        (
+            f"{j['parent']} - {j['child']}{'' if j['parent_correct'] else ' (wrong parent)'}",
+            f"{j['type']}{'' if j['type_correct'] else ' (wrong type)'}",
+            j,
+        )
         for j in metrics["joints"]
     ]
     joints += [("mean", kind, values) for kind, values in metrics["joints_mean"].items() if any(_known(values))]
@@ -49,7 +54,7 @@ def format_tables(metrics: dict[str, Any]) -> list[Table | str]:
     ]  # fmt: skip
     lines = [f"{key}: {_shown(value)}" for key, value in metrics["structure"].items()]
     lines += [f"note: {note}" for note in metrics["notes"]]
-    return [*(table for table in tables if table.row_count > 0), *lines]
+    return [*(table for table in tables if table.row_count > 0), *(Text(line) for line in lines)]
 
 
 def _known(values: dict[str, Any]) -> list[bool]:
@@ -63,7 +68,8 @@ def _table(title: str, names: list[str], columns: dict[str, str], rows: list[tup
     for header in columns.values():
         table.add_column(header, justify="right")
     for *labels, values in rows:
-        table.add_row(*labels, *(_shown(values[key]) for key in columns))
+        # As plain text: names may hold what rich takes for markup.
+        table.add_row(*map(Text, labels), *(_shown(values[key]) for key in columns))
     return table
 
 

@@ -106,7 +106,7 @@ class SemanticModel(SplatartModel):
 
     @torch.no_grad()
     def fade_outside(self, views: list[View]) -> None:
-        """Make Gaussians whose centre lies outside a silhouette, or which no view sees, transparent: they get pruned."""
+        """Make Gaussians with their centre outside a silhouette, or seen by no view, transparent: they get pruned."""
         outside = ~carve(views, self.means.cpu(), dilate=2).to(self.device)
         self.gauss_params["opacities"][outside] = -10.0
 

@@ -163,11 +163,12 @@ def sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int) -> Tenso
     offsets = (means.T + R.mT @ t).mT  # means - camera centre [C, N, 3], components contiguous
     norm2 = offsets.square().sum(-1, keepdim=True)
     basis = sh_basis(offsets * norm2.clamp_min(1e-24).rsqrt(), degree)
-    # Sums over the bands as matrix products: reducing [..., K, 3] over K is several times slower.
+    # Sum over the bands by matrix products: reducing [..., K, 3] over K is several times slower, as is a product with 3
+    # columns instead of 16.
     K = basis.shape[-1]
-    identity = torch.eye(max(K, 3), dtype=sh.dtype, device=sh.device)
-    per_channel = basis @ identity[:K, :K].repeat_interleave(3, dim=1)
-    return (per_channel * sh[..., :K, :].flatten(-2) @ identity[:3, :3].repeat(K, 1) + 0.5).clamp_min(0)
+    bands, channels = (torch.eye(*size, dtype=sh.dtype, device=sh.device) for size in ((K, K), (3, 16)))
+    terms = (basis @ bands.repeat_interleave(3, dim=1)) * sh[..., :K, :].flatten(-2)
+    return ((terms @ channels.repeat(K, 1))[..., :3] + 0.5).clamp_min(0)
 
 
 def _compositor(backend: Backend):

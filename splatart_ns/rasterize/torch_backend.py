@@ -22,7 +22,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad, threshold_
 
 TILE = 8
-LAYERS = 32
+LAYERS = 24
 TILES_PER_STEP = 512
 MAX_ALPHA = 0.999
 MIN_ALPHA = 1 / 255

@@ -184,9 +184,11 @@ def part_pair(
 ) -> PartPair | None:
     """Compare a part in about `num_views` views of each state, in which it covers about `pixels` pixels or fewer.
 
-    None when no labelled view of either state shows the part.
+    None when no labelled view of either state shows the part, or one of the states has no Gaussians of it.
     """
     parts = tuple(s.select(s.part_ids == part).detach() for s in splats)
+    if min(len(p) for p in parts) == 0:
+        return None
     device = parts[0].means.device
     pieces = []
     for state_views in views:

@@ -14,7 +14,6 @@ from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import PartPair, part_pair
 from splatart_ns.stages.refinement import refine
 from splatart_ns.stages.registration import MIN_POINTS, distinct, part_points, point_to_plane, register
-from splatart_ns.stages.visibility import visibility
 
 VIEWS = 5
 """Views of each state that are compared."""
@@ -89,36 +88,6 @@ def initial_motion(
         identity_ratio=identity_ratio,
         runner_up_ratio=cost[order[1]] / max(best.cost, 1e-12) if len(order) > 1 else float("inf"),
     )
-
-
-@dataclass(frozen=True)
-class InitialPoses:
-    """Where `PartPoses` may start."""
-
-    T: Tensor
-    """T[state][part] [S, P, 4, 4] float64, the identity at state 0."""
-    frozen: Tensor
-    """Poses that are not to be refined [S, P]: state 0, still parts, and parts that were not found."""
-    motions: list[list[InitialMotion]]
-    """Of every part, for the states from 1 on."""
-
-
-def initial_poses(
-    splats: Sequence[Splat], views: Sequence[Sequence[View]], num_parts: int, seed: int = 0
-) -> InitialPoses:
-    """Initial poses of parts 1..num_parts, from one labelled splat and the training views per state."""
-    seen = [visibility(s, v) for s, v in zip(splats, views, strict=True)]
-    motions = [
-        [
-            initial_motion((splats[0], splats[s]), (views[0], views[s]), (seen[0], seen[s]), part, seed)
-            for part in range(1, num_parts + 1)
-        ]
-        for s in range(1, len(splats))
-    ]
-    T = torch.stack([torch.stack([m.T for m in of_state]) for of_state in motions])
-    frozen = torch.tensor([[m.still or not m.found for m in of_state] for of_state in motions], device=T.device)
-    identity = torch.eye(4).to(T).expand(1, num_parts, 4, 4)
-    return InitialPoses(torch.cat([identity, T]), torch.cat([torch.ones_like(frozen[:1]), frozen]), motions)
 
 
 def choose(pair: PartPair, candidates: Tensor, similar: float, keep: int = 3) -> Tensor:

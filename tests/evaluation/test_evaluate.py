@@ -88,5 +88,22 @@ def test_a_bundle_of_another_capture_is_refused(bundle, folder, capture):
 
 def test_the_tables_show_every_joint_and_configuration(folder, capture):
     text = printed(evaluate(folder, capture))
-    for word in ("body - door", "door - latch", "state_01", "novel_00", "tree_exact: yes", "note: speed"):
+    for word in (
+        "axis angle",
+        "(deg)",
+        "body - door",
+        "door - latch",
+        "state_01",
+        "novel_00",
+        "tree_exact: yes",
+        "note: speed",
+    ):
         assert word in text
+
+
+def test_names_are_not_read_as_markup(bundle, folder, capture):
+    metrics = evaluate(folder, capture)
+    metrics["joints"][0] |= {"child": "[red]door", "parent_correct": False, "type_correct": False}
+    metrics["notes"] = ["[bold]x"]
+    text = printed(metrics)
+    assert "[red]door (wrong parent)" in text and "(wrong type)" in text and "[bold]x" in text
