@@ -38,6 +38,7 @@ method = MethodSpecification(
                 sh_degree_interval=100,
                 warmup_length=300,
                 stop_split_at=700,
+                stop_screen_size_at=0,  # splitting by size on the screen knows no bound
                 refine_every=100,
                 reset_alpha_every=1000,
                 cull_alpha_thresh=0.02,

@@ -14,6 +14,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
+from splatart_ns.bundle.motion_file import read_motions
 from splatart_ns.capture.view import View, load_views
 from splatart_ns.errors import InputError
 from splatart_ns.plugin.compat import read_checkpoint, read_run_config
@@ -102,7 +103,7 @@ class PosePipelineConfig(VanillaPipelineConfig):
     init: Literal["registration", "centroids", "file"] = "registration"
     """How poses start: many-start ICP chosen by rendering, parts' centroids, or `init_file`."""
     init_file: Path | None = None
-    """JSON with "motion": [state][part] 4x4 matrices, world at state 0 to that state, in the capture's unit."""
+    """A bundle's articulation.json, or another JSON file with the parts' motions in the same form."""
     snap: bool = True
     """Whether parts whose images fit no motion are held still."""
     seed: int = 0
@@ -145,7 +146,7 @@ class PosePipeline(VanillaPipeline):
         base = torch.eye(4, dtype=torch.float64).repeat(S, P, 1, 1)
         frozen = torch.zeros(S, P, dtype=torch.bool)
         if self.config.init == "file":
-            return self._poses_from_file(base), frozen
+            return self._poses_from_file(), frozen
         centroids = [part_extents(s, P)[0].cpu() for s in splats]
         seen = [visibility(s, v) for s, v in zip(splats, self.views, strict=True)]
         for s in range(1, S):
@@ -162,11 +163,10 @@ class PosePipeline(VanillaPipeline):
                 frozen[s, p] = not motion.found or (self.config.snap and motion.still)
         return base, frozen
 
-    def _poses_from_file(self, base: Tensor) -> Tensor:
-        from splatart_ns.bundle.motion_file import read_motions
-
-        motions = read_motions(self.config.init_file, tuple(base.shape[:2]))
-        return torch.from_numpy(self.datamanager.capture.normalization.motion_to_normal(motions)).to(base)
+    def _poses_from_file(self) -> Tensor:
+        capture = self.datamanager.capture
+        motions = read_motions(self.config.init_file, list(capture.parts.values()), len(capture.states))
+        return torch.from_numpy(capture.normalization.motion_to_normal(motions.numpy()))
 
     def _shuffled_pairs(self) -> Iterator[tuple[int, int, View]]:
         """(source, target, target view): all pairs of states in turn, both ways round, every view of a state before

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -97,15 +98,18 @@ def motion_covariance(pair: PartPair, T: Tensor) -> Tensor:
     translation is that of the world's origin. A sandwich estimate with views as clusters (Liang and Zeger 1986):
     neighbouring pixels err together (edges, shadows, a mixed Gaussian), so each view counts as one observation, however
     many pixels it has. Views of one state share the other state's Gaussians and err together too: what the two
-    directions disagree by is added.
+    directions disagree by is added. What no image shows (the turn of a plain round part) has the variance of a whole
+    turn: a prior of one half turn, or of 3 radii, keeps the estimate finite.
     """
     T = T.double()
     equations = _normal_equations(pair, T, 6)
+    # Mean squared residual of one of the 4 channels; a perfect fit has none.
+    variance = max(equations.cost / 2, 1e-9)
     V = len(equations.g)
     g = equations.g - equations.g.mean(0)
     directions = torch.stack([d.sum(0) for d in g.split([len(pair.views[1]), len(pair.views[0])])])
-    H_inv = torch.linalg.pinv(equations.H, hermitian=True)
-    local = H_inv @ (V / max(V - 6, 1) * g.T @ g + directions.T @ directions) @ H_inv
+    H_inv = torch.linalg.inv(equations.H + variance / math.pi**2 * torch.eye(6).to(T))
+    local = H_inv @ (V / max(V - 6, 1) * g.T @ g + directions.T @ directions) @ H_inv + variance * H_inv
     # From (radii, radians) about the moved centroid to the world's origin.
     A = torch.eye(6, dtype=T.dtype, device=T.device)
     A[:3, :3] *= pair.radius

@@ -20,7 +20,7 @@ VIEWS = 5
 COARSE_PIXELS = 1500
 """Choosing needs no more pixels a view than this."""
 FINE_PIXELS = 10000
-"""Refining needs as many; coarse images would bias it (POSES.md, section 4)."""
+"""Refining needs as many; coarse images would bias it."""
 SIMILAR = 2.5
 """Candidates that cost more than this many times the best are dropped before refining."""
 STILL_RATIO = 1.2
