@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import random
+import sys
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 import torch
 import yaml
+from nerfstudio.viewer.viewer_elements import ViewerControl
 
 from splatart_ns.errors import InputError
 
@@ -19,6 +22,22 @@ def allow_checkpoint_scalars() -> None:
     Its schedulers store NumPy scalars, which torch >= 2.6 refuses by default. They hold a number and nothing else.
     """
     torch.serialization.add_safe_globals([np.core.multiarray.scalar, np.dtype, type(np.dtype("float64"))])
+
+
+def report_input_errors() -> None:
+    """Let nerfstudio's commands end with one sentence and exit code 2 where an `InputError` ends them.
+
+    Only what nobody catches comes here: `splatart fit` and notebooks get the exception itself.
+    """
+    previous = sys.excepthook
+
+    def report(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if issubclass(kind, InputError):
+            print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(2)  # Python honours it here, as anywhere
+        previous(kind, error, trace)
+
+    sys.excepthook = report
 
 
 def seed_everything(seed: int) -> None:
@@ -74,4 +93,39 @@ def read_checkpoint(config: Path) -> dict[str, torch.Tensor]:
         raise InputError(f"{files[-1]} cannot be read ({type(error).__name__}); train that stage again.") from None
 
 
+def finished_runs(capture: Path, method: str) -> list[Path]:
+    """The config.yml of every run of a method on a capture under outputs/ that left a checkpoint, oldest first."""
+    configs = Path("outputs").glob(f"*/{method}/*/config.yml")
+    finished = [c for c in configs if any((c.parent / "nerfstudio_models").glob("step-*.ckpt"))]
+    on_capture = [c for c in finished if _data_of(read_run_config(c)).resolve() == capture.resolve()]
+    return sorted(on_capture, key=lambda config: config.stat().st_mtime)
+
+
+def _data_of(run: dict[str, Any]) -> Path:
+    """Where the data of a run are; paths are lists of their parts in config.yml."""
+    datamanager = run["pipeline"]["datamanager"]
+    return Path(*(datamanager["data"] or datamanager["dataparser"]["data"] or ()))
+
+
+class StartView(ViewerControl):
+    """Shows who connects to the viewer an object of radius 1 about the origin as a whole."""
+
+    DISTANCE = 2.2
+
+    def __init__(self, direction: np.ndarray):
+        self.position = self.DISTANCE * direction / np.linalg.norm(direction)
+
+    def _setup(self, viewer) -> None:
+        super()._setup(viewer)
+        self.viser_server.on_client_connect(self._place)
+
+    def _place(self, client) -> None:
+        from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+
+        with client.atomic():
+            client.camera.position = VISER_NERFSTUDIO_SCALE_RATIO * self.position
+            client.camera.look_at = np.zeros(3)
+
+
 allow_checkpoint_scalars()
+report_input_errors()

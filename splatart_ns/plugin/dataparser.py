@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,18 +37,18 @@ class SplatartDataParser(DataParser):
 
     @property
     def capture(self) -> Capture:
-        """The whole capture; checked when it is first read. A user's mistake ends the process with one sentence."""
+        """The whole capture; checked when it is first read.
+
+        Raises:
+            InputError: for a capture that cannot be used, or a state that it does not have.
+        """
         if self._capture is None:
-            try:
-                capture = require_valid(self.config.data)
-                if not 0 <= self.config.state < len(capture.states):
-                    raise InputError(
-                        f"{self.config.data} has no state {self.config.state}; "
-                        f"choose --state between 0 and {len(capture.states) - 1}."
-                    )
-            except InputError as error:
-                print(f"error: {error}", file=sys.stderr)
-                raise SystemExit(2) from None
+            capture = require_valid(self.config.data)
+            if not 0 <= self.config.state < len(capture.states):
+                raise InputError(
+                    f"{self.config.data} has no state {self.config.state}; "
+                    f"choose --state between 0 and {len(capture.states) - 1}."
+                )
             self._capture = capture
         return self._capture
 
@@ -84,6 +83,7 @@ class SplatartDataParser(DataParser):
                 "normalization": normalization,
                 "state": self.config.state,
                 "part_names": ["background", *capture.parts.values()],
+                "length_unit": capture.length_unit,
             },
             dataparser_transform=torch.from_numpy(
                 np.concatenate([np.eye(3), -normalization.centre[:, None]], axis=1)

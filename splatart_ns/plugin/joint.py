@@ -20,14 +20,14 @@ from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.folder import save_bundle
 from splatart_ns.capture.capture import Normalization
 from splatart_ns.errors import InputError
-from splatart_ns.plugin.compat import read_checkpoint
+from splatart_ns.plugin.compat import finished_runs, read_checkpoint
 from splatart_ns.plugin.gaussians import gauss_params_from_splat, splat_from_state
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.joint import JointFit
 from splatart_ns.stages.pose import carry
-from splatart_ns.stages.tree import EPSILON, infer_tree
+from splatart_ns.stages.tree import EPSILON, JointMethod, infer_tree
 
 JOINT_TYPES = ("revolute", "prismatic", "screw", "fixed")
 MIN_POINT_OPACITY = 0.3
@@ -109,22 +109,21 @@ class JointModel(SplatartModel):
         return KinematicTree(list(range(1, self.num_parts + 1)), int(self.root), joints)
 
     def add_sliders(self, scale: float) -> None:
-        """One slider for each joint that moves, in degrees or the capture's length, over the observed range and half
+        """One slider for each joint that moves, in degrees or the capture's unit, over the observed range and half
         as much on both sides. `scale` is the normalisation's."""
         self.register_buffer("world_scale", torch.tensor(scale, dtype=torch.float64, device=self.device))
+        length_unit = self.kwargs["metadata"]["length_unit"]
         for index, joint in enumerate(self.tree.movable):
             turns = joint.fit.type != "prismatic"
             unit = math.degrees(1) if turns else 1 / scale
-            low, high = (limit * unit for limit in joint.fit.limits)
-            beyond = 0.5 * (high - low)
-            low, high = low - beyond, high + beyond
-            names = self.part_names[joint.parent], self.part_names[joint.child]
+            low, high, step = slider_range(*(limit * unit for limit in joint.fit.limits))
             slider = ViewerSlider(
-                name=f"{names[0]} to {names[1]} ({'degree' if turns else 'length'})",
+                name=f"{self.part_names[joint.parent]}_to_{self.part_names[joint.child]} "
+                f"({'degree' if turns else 'length' if length_unit == 'unknown' else length_unit})",
                 default_value=float(joint.fit.values[self._shown_state(joint.fit.values)]) * unit,
                 min_value=low,
                 max_value=high,
-                step=(high - low) / 200,
+                step=step,
             )
             # The viewer finds attributes, not lists of them, and shows them in the order of their names.
             setattr(self, f"joint_{index:02d}", slider)
@@ -158,17 +157,32 @@ class JointModel(SplatartModel):
         return super().load_state_dict(state, **kwargs)
 
 
+def slider_range(low: float, high: float) -> tuple[float, float, float]:
+    """Ends and step of a slider for what was observed from `low` to `high`: half as much more on both sides, and a
+    step of 1, 0.1, 0.01, ... that makes hundreds of places."""
+    beyond = max(0.5 * (high - low), 1e-3)
+    decimals = 2 - math.floor(math.log10(high - low + 2 * beyond))
+    step = 10.0**-decimals
+    return (
+        round(math.floor((low - beyond) / step) * step, decimals),
+        round(math.ceil((high + beyond) / step) * step, decimals),
+        step,
+    )
+
+
 @dataclass
 class JointPipelineConfig(VanillaPipelineConfig):
     """Stages 3 and 4."""
 
     _target: type = field(default_factory=lambda: JointPipeline)
     pose_run: Path | None = None
-    """The config.yml of the splatart-pose run; the latest under outputs/<capture>/splatart-pose when not given."""
+    """The config.yml of the splatart-pose run; the latest one on this capture under outputs/ when not given."""
     root: str | None = None
     """Name of the part that the others hang on; chosen when not given."""
     epsilon: float = EPSILON
     """Largest residual of an accepted joint, as a share of the object's bounding radius."""
+    method: JointMethod = "screw"
+    """How joints are fitted: in closed form and refined, or by the paper's gradient descent (slow, for comparison)."""
     seed: int = 0
     """Noted in the bundle."""
     settings: dict[str, Any] = field(default_factory=dict)
@@ -186,7 +200,14 @@ class JointPipeline(VanillaPipeline):
             return
         capture = self.datamanager.capture
         normalization = capture.normalization
-        state = read_checkpoint(config.pose_run or find_pose_run(capture.path))
+        run = config.pose_run or find_pose_run(capture.path)
+        state = read_checkpoint(run)
+        shape = (len(capture.states), len(capture.parts))
+        if "_model.merged" not in state or state["_model.poses.base"].shape[:2] != shape or not state["_model.merged"]:
+            raise InputError(
+                f"{run} is no finished splatart-pose run on a capture of {shape[0]} states and {shape[1]} parts; "
+                f"run `ns-train splatart-pose --data {capture.path}` again."
+            )
         splat = splat_from_state(state)
         ids = splat.part_ids
         world = splat_to_world(splat, normalization)
@@ -212,6 +233,7 @@ class JointPipeline(VanillaPipeline):
             root=root,
             render_ratios=ratios,
             epsilon=config.epsilon,
+            method=config.method,
         )
         for part, reason in self.tree.unattached.items():
             CONSOLE.log(f"{capture.parts[part]}: {reason}")
@@ -249,16 +271,18 @@ def covariances_to_world(covariance: Tensor, normalization: Normalization) -> Te
 
 
 def find_pose_run(capture: Path) -> Path:
-    """The latest finished splatart-pose run under outputs/.
+    """The latest finished splatart-pose run on the capture under outputs/.
 
     Raises:
         InputError: when there is none.
     """
-    folder = Path("outputs") / capture.name / "splatart-pose"
-    runs = [c for c in folder.glob("*/config.yml") if list((c.parent / "nerfstudio_models").glob("step-*.ckpt"))]
+    runs = finished_runs(capture, "splatart-pose")
     if not runs:
-        raise InputError(f"{folder} holds no finished run; run `ns-train splatart-pose --data {capture}` first.")
-    return max(runs, key=lambda p: p.stat().st_mtime)
+        raise InputError(
+            f"outputs/ holds no finished splatart-pose run on {capture}; run `ns-train splatart-pose --data {capture}` "
+            f"first, or name its config.yml by --pipeline.pose-run."
+        )
+    return runs[-1]
 
 
 @dataclass
@@ -281,7 +305,9 @@ class JointTrainer(Trainer):
         )
         folder = self.config.bundle_dir or self.base_dir / "bundle"
         save_bundle(self.pipeline.bundle, folder)
-        CONSOLE.print(f"Bundle: {folder}")
+        self.save_checkpoint(self.step)
+        CONSOLE.print(f"Bundle: {folder}\nConfig: {self.base_dir / 'config.yml'}")
         self._init_viewer_state()
         self.pipeline.eval()
-        self._after_train()
+        if not self.config.viewer.quit_on_train_completion:
+            self._train_complete_viewer()

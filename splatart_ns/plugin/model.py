@@ -12,6 +12,7 @@ from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from torch import Tensor, nn
 
 from splatart_ns.geometry.camera import viewmat_from_opengl
+from splatart_ns.plugin.compat import StartView
 from splatart_ns.plugin.gaussians import gauss_params_from_splat, random_splat, splat_from_points
 from splatart_ns.rasterize.render import Rendering, render
 from splatart_ns.rasterize.ssim import ssim
@@ -49,9 +50,11 @@ class SplatartModel(SplatfactoModel):
 
     def populate_modules(self) -> None:
         """Gaussians from seed points or at random, strategy and metrics; nothing is downloaded."""
-        names = self.kwargs["metadata"]["part_names"]
-        self.num_parts = len(names) - 1
-        self.part_names = names
+        metadata = self.kwargs["metadata"]
+        self.part_names = metadata["part_names"]
+        self.num_parts = len(self.part_names) - 1
+        first_camera = metadata["normalization"].camera_to_normal(metadata["frames"][0].T_world_camera)
+        self.start_view = StartView(first_camera[:3, 3])
         if self.seed_points is not None and not self.config.random_init:
             splat = splat_from_points(*self.seed_points, self.config.sh_degree, self.num_parts)
         else:

@@ -12,6 +12,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from torch import Tensor
 
 from splatart_ns.capture.view import View
+from splatart_ns.errors import InputError
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.rasterize.ssim import l1_ssim_loss
 from splatart_ns.stages.hull import carve
@@ -153,8 +154,6 @@ class SemanticPipeline(VanillaPipeline):
 
     def get_train_loss_dict(self, step: int):
         if self.model.learns_parts:
-            if not self._labelled():
-                raise RuntimeError("no training frame has labels")
             camera, batch = self._next_labelled(step)
             outputs = self._model(camera)
             return outputs, self.model.get_loss_dict(outputs, batch), self.model.get_metrics_dict(outputs, batch)
@@ -174,6 +173,12 @@ class SemanticPipeline(VanillaPipeline):
                 return camera, batch
 
     def get_training_callbacks(self, training_callback_attributes) -> list[TrainingCallback]:
+        start, steps = self.model.config.semantic_start, training_callback_attributes.trainer.config.max_num_iterations
+        if start >= steps:
+            raise InputError(
+                f"The run ends after {steps} steps and the parts are learned from step {start} on; "
+                f"raise --max-num-iterations or lower --pipeline.model.semantic-start."
+            )
         callbacks = super().get_training_callbacks(training_callback_attributes)
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         callbacks.append(TrainingCallback(before, self._keep_inside))

@@ -9,8 +9,9 @@ for instance. Contact tells them apart.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -19,6 +20,9 @@ from splatart_ns.geometry.se3 import adjoint, inverse, transform_points
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.contact import Contact, find_contacts
 from splatart_ns.stages.joint import EPSILON, NOISE, JointFit, fit_joint, fit_joints, surface_noise
+from splatart_ns.stages.joint_descent import descend_joint
+
+JointMethod = Literal["screw", "descent"]
 
 
 def object_radius(points: dict[int, Tensor]) -> float:
@@ -38,16 +42,22 @@ def infer_tree(
     render_ratios: dict[tuple[int, int], float] | None = None,
     noise: float = NOISE,
     epsilon: float = EPSILON,
+    method: JointMethod = "screw",
 ) -> KinematicTree:
     """Joints and tree from the parts' points [N, 3] at state 0 and their motions [S, 4, 4], both by part id.
 
     `covariances` [S, 6, 6]: of the motions, T_true = exp(d) T with d = (translation, rotation) about the world's
-    origin. `render_ratios` by (parent, child) in either order; `noise` and `epsilon` as in `fit_joint`.
+    origin. `render_ratios` by (parent, child) in either order; `noise` and `epsilon` as in `fit_joint`. `method`
+    "screw" fits in closed form and refines; "descent" is the paper's gradient descent, which knows no covariances and
+    no ratios, for comparison.
     """
     radius = object_radius(points)
-    joints = fit_pairs(
-        points, motions, radius, covariances=covariances, render_ratios=render_ratios, noise=noise, epsilon=epsilon
-    )
+    if method == "descent":
+        joints = descend_pairs(points, motions, radius, epsilon)
+    else:
+        joints = fit_pairs(
+            points, motions, radius, covariances=covariances, render_ratios=render_ratios, noise=noise, epsilon=epsilon
+        )
     if root is None:
         root = choose_root(points, motions, radius, noise)
     return build_tree(sorted(points), joints, find_contacts(points, motions), root, radius)
@@ -85,6 +95,27 @@ def fit_pairs(
         epsilon,
         [ratios.get((a, b), ratios.get((b, a))) for a, b in pairs],
     )
+    return _both_ways(pairs, fits, T_rel, points)
+
+
+def descend_pairs(
+    points: dict[int, Tensor], motions: dict[int, Tensor], object_radius: float, epsilon: float = EPSILON
+) -> dict[tuple[int, int], JointFit]:
+    """As `fit_pairs`, in the paper's way: of a revolute and a prismatic joint by gradient descent, the better one."""
+    pairs = [(a, b) for a in sorted(points) for b in sorted(points) if a < b]
+    T_rel = [inverse(motions[a].double()) @ motions[b].double() for a, b in pairs]
+    fits = []
+    for (_, b), T in zip(pairs, T_rel, strict=True):
+        both = [descend_joint(kind, T, points[b]) for kind in ("revolute", "prismatic")]
+        best = min(both, key=lambda fit: fit.residual)
+        fits.append(replace(best, accepted=best.residual <= epsilon * object_radius))
+    return _both_ways(pairs, fits, T_rel, points)
+
+
+def _both_ways(
+    pairs: list[tuple[int, int]], fits: Sequence[JointFit], T_rel: Sequence[Tensor], points: dict[int, Tensor]
+) -> dict[tuple[int, int], JointFit]:
+    """Joints by (parent, child) from those of pairs (a, b) with motions T_rel of b relative to a."""
     joints = {}
     for (a, b), fit, T in zip(pairs, fits, T_rel, strict=True):
         joints[a, b] = fit

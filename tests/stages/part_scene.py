@@ -70,9 +70,7 @@ def photograph(splat: Splat, count: int = 10, pixels: int = 64) -> list[View]:
     K = torch.tensor([[1.4 * pixels, 0, pixels / 2], [0, 1.4 * pixels, pixels / 2], [0, 0, 1]])
     views = []
     for k, viewmat in enumerate(cameras(count)):
-        r = render(
-            splat, viewmat[None], K[None], pixels, pixels, features=splat.part_probabilities, with_depth=False
-        )
+        r = render(splat, viewmat[None], K[None], pixels, pixels, features=splat.part_probabilities, with_depth=False)
         alpha = r.accumulation[0]
         labels = torch.where(alpha[..., 0] > 0.5, r.features[0].argmax(-1), 0)
         views.append(

@@ -1,0 +1,86 @@
+import pytest
+import torch
+from part_scene import motion, two_states
+
+from splatart_ns.stages.part_pair import best_views, part_pair, part_view
+
+EYE = torch.eye(4, dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return two_states(motion((0, 0, 25), (0.3, 0.0, 0.0)))
+
+
+def test_only_the_part_and_the_background_count(scene):
+    view = scene[1][0][0]
+    piece = part_view(view, 2)
+    left, top = (round(float(x)) for x in (view.K - piece.K)[:2, 2])
+    labels = view.labels[top:, left:][: piece.weight.shape[0], : piece.weight.shape[1]]
+    assert torch.equal(piece.weight, (labels != 1).float())
+    assert piece.area == (view.labels == 2).sum()
+
+
+def test_unlabelled_pixels_do_not_count(scene):
+    view = scene[1][0][0]
+    labels = view.labels.clone()
+    view.labels = labels.clone().masked_fill_(labels == 0, 255)
+    piece = part_view(view, 2)
+    view.labels = labels
+    assert (piece.weight.sum() == piece.area) and piece.area > 0
+
+
+def test_an_unlabelled_view_tells_only_of_the_background(scene):
+    view = scene[1][0][0]
+    labels, view.labels = view.labels, None
+    piece = part_view(view, 2)
+    view.labels = labels
+    assert piece.area == 0
+    assert not piece.rgba[piece.weight == 1].any()
+    assert (piece.weight == 0).any() and (piece.weight == 1).any()
+
+
+def test_a_smaller_piece_shows_the_same(scene):
+    splats, views = scene
+    part = splats[0].select(splats[0].part_ids == 2)
+    for factor in (1, 2, 3):
+        piece = part_view(views[0][0], 2, factor)
+        image = piece.render(part, EYE[None])[0]
+        inside = piece.weight == 1
+        assert (image - piece.rgba)[inside].abs().mean() < 0.02, factor
+
+
+def test_the_right_motion_costs_least(scene):
+    splats, views = scene
+    truth = motion((0, 0, 25), (0.3, 0.0, 0.0))
+    pair = part_pair(splats, views, 2, num_views=4, pixels=500)
+    wrong = [motion((0, 0, 25 + a), (0.3 + t, 0, 0)) for a, t in ((180, 0), (5, 0), (-5, 0), (0, 0.05), (0, -0.05))]
+    cost = pair.cost(torch.stack([truth, EYE, *wrong]))
+    assert (cost[1:] > 1.5 * cost[0]).all()
+
+
+def test_views_are_chosen_that_show_the_part_from_all_around(scene):
+    views = scene[1][0]
+    chosen = best_views(views, 2, 4)
+    assert len({v.name for v in chosen}) == 4
+    directions = torch.stack([v.viewmat[2, :3] for v in chosen])
+    assert (directions @ directions.T).amin() < -0.3
+    assert len(best_views(views, 2, 99)) <= len(views)
+    assert best_views(views, 7, 4) == []
+
+
+def test_unlabelled_views_fill_up_where_labels_are_few(scene):
+    views = scene[1][0]
+    kept = [v.labels for v in views]
+    for v in views[1:]:
+        v.labels = None
+    chosen = best_views(views, 2, 3)
+    for v, labels in zip(views, kept, strict=True):
+        v.labels = labels
+    assert len(chosen) == 3 and chosen[0] is views[0]
+
+
+def test_a_part_that_a_state_lacks_makes_no_pair(scene):
+    splats, views = scene
+    without = splats[1].select(splats[1].part_ids != 2)
+    assert part_pair((splats[0], without), views, 2, num_views=3, pixels=500) is None

@@ -1,0 +1,106 @@
+import math
+
+import pytest
+import torch
+from part_scene import angle_deg, box, inverse, motion, nearby, photograph, two_states
+
+from splatart_ns.geometry.se3 import se3_log, transform_points
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.part_pair import part_pair
+from splatart_ns.stages.refinement import increment, motion_covariance, refine, rotation_held_ratio
+
+TURN = motion((10, 0, 40), (0.3, -0.2, 0.1))
+SLIDE = motion((0, 0, 0), (0.3, 0.2, 0.0))
+
+
+def pair_of(T: torch.Tensor, noise: float = 0.0):
+    splats, views = two_states(T)
+    if noise > 0:
+        g = torch.Generator().manual_seed(0)
+        for splat in splats:
+            splat.means += noise * torch.randn(splat.means.shape, generator=g)
+    return part_pair(splats, views, 2, num_views=5, pixels=5000)
+
+
+@pytest.fixture(scope="module")
+def turned():
+    return pair_of(TURN)
+
+
+def test_an_increment_turns_about_the_moved_centroid(turned):
+    xi = torch.tensor([[0.1, 0.0, 0.0, 0.3, 0.2, 0.1]]).double()
+    before, after = (transform_points(T, turned.centroid[None])[0] for T in (TURN, increment(TURN, xi, *of(turned))[0]))
+    assert torch.allclose(after - before, torch.tensor([0.1 * turned.radius, 0, 0]).double())
+    assert angle_deg(increment(TURN, xi, *of(turned))[0], TURN) == pytest.approx(math.degrees(xi[0, 3:].norm()))
+
+
+def of(pair):
+    return pair.centroid, pair.radius
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_refining_finds_the_motion(turned, seed):
+    start = nearby(TURN, 0.04, seed)
+    found = refine(turned, start, 15)
+    assert angle_deg(found.T, TURN) < 0.2
+    shift = transform_points(inverse(TURN) @ found.T, turned.centroid[None])[0] - turned.centroid
+    assert shift.norm() < 0.005 * turned.radius
+    assert found.cost < float(turned.cost(start[None])[0])
+
+
+def test_refining_never_makes_it_worse(turned):
+    far = nearby(TURN, 0.5)
+    assert refine(turned, far, 3).cost <= float(turned.cost(far[None])[0])
+
+
+def test_holding_the_rotation_moves_only_the_centroid(turned):
+    start = nearby(TURN, 0.04)
+    held = refine(turned, start, hold_rotation=True)
+    assert torch.allclose(held.T[:3, :3], start[:3, :3], atol=1e-12)
+    assert not torch.allclose(held.T[:3, 3], start[:3, 3])
+
+
+def test_a_slide_fits_as_well_with_the_rotation_held_and_a_turn_does_not(turned):
+    eye = torch.eye(3, dtype=torch.float64)
+    slid = pair_of(SLIDE, noise=0.01)
+    assert rotation_held_ratio(slid, SLIDE, eye) < 1.2
+    assert rotation_held_ratio(turned, TURN, eye) > 3
+
+
+def test_the_covariance_covers_the_error():
+    pair = pair_of(TURN, noise=0.02)
+    found = refine(pair, TURN, 15)
+    covariance = motion_covariance(pair, found.T)
+    assert torch.allclose(covariance, covariance.T)
+    assert (torch.linalg.eigvalsh(covariance) > 0).all()
+    xi = se3_log(found.T @ inverse(TURN))
+    assert xi @ torch.linalg.solve(covariance, xi) < 9 * 6
+    assert xi.norm() > 1e-4
+
+
+def test_a_tiny_part_turns_less_certainly_than_a_large_one():
+    def sigma(size: float) -> float:
+        part = box(2, (size, 0.6 * size, 0.5 * size), (0.0, 0.0, 0.0), spacing=size / 8)
+        part.means += 0.02 * size * torch.randn(part.means.shape, generator=torch.Generator().manual_seed(0))
+        splats = (part, part.transformed(TURN))
+        pair = part_pair(splats, tuple(photograph(s) for s in splats), 2, num_views=5, pixels=5000)
+        covariance = motion_covariance(pair, refine(pair, TURN, 10).T)
+        return float(covariance[3:, 3:].trace().sqrt())
+
+    assert sigma(0.15) > 2 * sigma(1.0)
+
+
+def test_a_turn_that_no_image_shows_is_uncertain():
+    n = 8
+    rod = Splat(
+        means=torch.tensor([0.0, 0.0, 1.0]) * torch.linspace(-0.5, 0.5, n)[:, None],
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        log_scales=torch.full((n, 3), math.log(0.1)),
+        opacity_logits=torch.full((n,), 2.0),
+        sh=torch.linspace(-1, 1, n)[:, None, None].expand(n, 1, 3),
+        part_logits=torch.tensor([-8.0, -8.0, 0.0]).repeat(n, 1),
+    )
+    pair = part_pair((rod, rod), (photograph(rod), photograph(rod)), 2, num_views=5, pixels=5000)
+    sigma = motion_covariance(pair, torch.eye(4)).diagonal().sqrt()
+    assert sigma[5] > 1
+    assert (sigma[:5] < 0.01).all()

@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+import torch
+from part_scene import angle_deg, box, motion, photograph, two_states
+
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.part_pair import part_pair
+from splatart_ns.stages.registration import part_points, register
+from splatart_ns.stages.render_choice import choose, initial_motion
+from splatart_ns.stages.visibility import visibility
+
+TRUTH = motion((0, 0, 70), (0.3, 0.2, 0.1))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    splats, views = two_states(TRUTH)
+    return splats, views, tuple(visibility(s, v) for s, v in zip(splats, views, strict=True))
+
+
+def test_rendering_chooses_among_flipped_candidates(scene):
+    splats, views, _ = scene
+    pair = part_pair(splats, views, 2, num_views=3, pixels=400)
+    c = pair.centroid.numpy()
+    flips = []
+    for axis in np.eye(3):
+        F = motion(tuple(180 * axis), (0, 0, 0)).numpy()
+        F[:3, 3] = c - F[:3, :3] @ c
+        flips.append(TRUTH @ torch.from_numpy(F))
+    candidates = torch.stack([*flips, TRUTH])
+    assert torch.equal(choose(pair, candidates, similar=1e9, keep=4)[0], TRUTH)
+
+
+def test_candidates_much_worse_than_the_best_and_twins_are_dropped(scene):
+    splats, views, _ = scene
+    pair = part_pair(splats, views, 2, num_views=3, pixels=400)
+    twin = TRUTH @ motion((0, 0, 1), (0, 0, 0))
+    far = TRUTH @ motion((90, 0, 0), (2, 0, 0))
+    assert len(choose(pair, torch.stack([twin, TRUTH, far]), similar=2.5)) == 1
+
+
+def test_the_motion_of_a_part_is_found_from_splats_and_views(scene):
+    found = initial_motion(*scene, part=2)
+    assert found.found and not found.still
+    assert angle_deg(found.T, TRUTH) < 0.3
+    assert torch.allclose(found.T[:3, 3], TRUTH[:3, 3], atol=5e-3)
+    assert found.identity_ratio > 3
+
+
+def test_a_still_part_does_not_move_at_all(scene):
+    found = initial_motion(*scene, part=1)
+    assert found.still
+    assert torch.equal(found.T, torch.eye(4, dtype=torch.float64))
+
+
+def test_a_tin_that_looks_alike_upside_down_but_for_its_colour_is_not_flipped():
+    T = motion((180, 0, 0), (0.0, 0.3, 0.0))
+    plate = box(1, (1.0, 1.0, 0.1), (0.0, 0.0, 0.0), spacing=0.08)
+    splats = (plate, plate.transformed(T))
+    views = tuple(photograph(s) for s in splats)
+    seen = tuple(visibility(s, v) for s, v in zip(splats, views, strict=True))
+    # The points alone fit nearly as well unturned.
+    candidates = register(*(part_points(s, v, 1) for s, v in zip(splats, seen, strict=True)))
+    assert len(candidates.T) > 1
+    assert angle_deg(initial_motion(splats, views, seen, part=1).T, T) < 0.5
+
+
+def test_a_part_missing_in_one_state_is_reported(scene):
+    splats, views, seen = scene
+    kept = splats[1].part_ids != 2
+    found = initial_motion((splats[0], splats[1].select(kept)), views, (seen[0], seen[1][kept]), part=2)
+    assert not found.found
+    assert torch.equal(found.T, torch.eye(4, dtype=torch.float64))
+
+
+def test_without_labelled_views_the_registration_decides(scene):
+    splats, views, seen = scene
+    blind = tuple([type(v)(**{**vars(v), "labels": None}) for v in state] for state in views)
+    found = initial_motion(splats, blind, seen, part=2)
+    assert found.found and angle_deg(found.T, TRUTH) < 10
+
+
+def test_a_few_gaussians_of_a_sliver_are_enough():
+    sliver = box(2, (0.2, 0.1, 0.06), (0.4, 0.0, 0.3), spacing=0.03)
+    T = motion((0, 0, 0), (-0.3, 0.1, 0.0))
+    base = box(1, (0.9, 0.6, 0.3), (0.0, 0.0, 0.0))
+    splats = tuple(Splat.cat([base, s]) for s in (sliver, sliver.transformed(T)))
+    views = tuple(photograph(s) for s in splats)
+    seen = tuple(visibility(s, v) for s, v in zip(splats, views, strict=True))
+    found = initial_motion(splats, views, seen, part=2)
+    centre = torch.tensor([0.4, 0.0, 0.3, 1.0], dtype=torch.float64)
+    assert ((found.T - T) @ centre)[:3].norm() < 0.01
