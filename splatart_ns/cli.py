@@ -1,4 +1,4 @@
-"""The command `splatart`: a thin front of the package."""
+"""Gaussian splats of articulated objects that can be posed: fit them to images, render and evaluate them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def fit(
 def render(
     bundle: Annotated[Path, tyro.conf.Positional],
     output: Path,
-    set: tuple[str, ...] = (),
+    set: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction] = (),
     sweep: bool = False,
     trajectory: Path | None = None,
     channel: Literal["rgb", "depth", "accumulation", "parts"] = "rgb",
@@ -84,8 +84,9 @@ def render(
 
     if sweep and trajectory is not None:
         raise InputError("--sweep and --trajectory are both given; choose one.")
+    _check_numbers(frames, fps, resolution, azimuth, elevation, background)
     loaded = load_bundle(bundle)
-    base = configurations.parse_settings(set, loaded)
+    base = configurations.parse_settings(sum(set, ()), loaded)
     if trajectory is not None:
         path = [base | q for q in configurations.read_trajectory(trajectory, loaded)]
     else:
@@ -98,6 +99,27 @@ def render(
         view = viewpoint.orbit_viewpoint(*sphere, turn, math.radians(elevation), resolution, resolution)
     images = animation.render_frames(loaded, path, view, channel, background, _device())
     CONSOLE.print(f"{animation.write_frames(images, output, fps)} frames: {output}")
+
+
+def _check_numbers(
+    frames: int,
+    fps: float,
+    resolution: int,
+    azimuth: float | None,
+    elevation: float,
+    background: tuple[float, float, float],
+) -> None:
+    wrong = {
+        "frames": (frames, "1 or more", frames < 1),
+        "fps": (fps, "a number above 0, at most 1000", not 0 < fps <= 1000),
+        "resolution": (resolution, "1 or more", resolution < 1),
+        "azimuth": (azimuth, "a finite angle", azimuth is not None and not math.isfinite(azimuth)),
+        "elevation": (elevation, "-90 to 90", not -90 <= elevation <= 90),
+        "background": (background, "three numbers from 0 to 1", not all(0 <= c <= 1 for c in background)),
+    }
+    for name, (value, mend, is_wrong) in wrong.items():
+        if is_wrong:
+            raise InputError(f"--{name} is {value}; give {mend}.")
 
 
 def evaluate(bundle: Annotated[Path, tyro.conf.Positional], data: Path) -> None:
@@ -193,6 +215,12 @@ def main() -> None:
         message = str(error)
         print(f"error: {message}" + ("" if message.endswith(".") else "."), file=sys.stderr)
         raise SystemExit(2) from None
+    except OSError as error:
+        if error.filename is None:
+            raise
+        mend = "check the path, its permissions and the space on the disk"
+        print(f"error: {error.filename}: cannot be read or written ({error.strerror}); {mend}.", file=sys.stderr)
+        raise SystemExit(2) from None
     except KeyboardInterrupt:
-        print("Interrupted. The same command goes on after the last finished stage.", file=sys.stderr)
+        print("Interrupted. An unfinished `splatart fit` goes on when it is started again.", file=sys.stderr)
         raise SystemExit(130) from None

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
+# Narrow enough for a terminal of 80 columns; metrics.json has all figures.
 _JOINT_COLUMNS = {
-    "axis_angle": "axis angle\n(deg)",
-    "axis_position": "axis position\n(0.1 length)",
-    "pivot_offset": "pivot offset\n(length)",
-    "motion_geodesic": "motion\n(deg | length)",
-    "motion_value": "travel\n(deg | length)",
-    "displacement": "displacement\n(length)",
-    "displacement_percent": "displacement\n(% of radius)",
-    "covered_95": "in 95 %\nregion",
+    "axis_angle": "axis\ndeg",
+    "axis_position": "axis pos\n0.1 len",
+    "pivot_offset": "pivot\nlength",
+    "motion_geodesic": "motion\ndeg|len",
+    "motion_value": "travel\ndeg|len",
+    "displacement_percent": "ADD\n% radius",
+    "covered_95": "in\n95 %",
 }
-_PART_COLUMNS = {"part_rotation": "rotation\n(deg)", "part_translation": "translation\n(length)"}
+_PART_COLUMNS = {"part_rotation": "rotation\ndeg", "part_translation": "translation\nlength"}
 _IMAGE_COLUMNS = {
-    "psnr": "PSNR\n(dB)",
+    "psnr": "PSNR\ndB",
     "ssim": "SSIM\n",
     "lpips": "LPIPS\n",
     "accumulation_l1": "accumulation\nL1",
@@ -32,15 +33,15 @@ def format_tables(metrics: dict[str, Any]) -> list[Table | Text]:
     """Everything in `metrics` for rich to print, one item after the other; tables without rows are left out."""
     joints = [
         (
-            f"{j['parent']} - {j['child']}{'' if j['parent_correct'] else ' (wrong parent)'}",
-            f"{j['type']}{'' if j['type_correct'] else ' (wrong type)'}",
+            f"{j['child']}{'' if j['parent_correct'] else ' (wrong parent)'}",
+            f"{j['type']}{'' if j['type_correct'] else ' (wrong)'}",
             j,
         )
         for j in metrics["joints"]
     ]
     joints += [("mean", kind, values) for kind, values in metrics["joints_mean"].items() if any(_known(values))]
     tables = [
-        _table("Joints", ["joint", "type"], _JOINT_COLUMNS, joints),
+        _table("Joints, by the part that moves", ["joint", "type"], _JOINT_COLUMNS, joints),
         _table("Part poses, relative to the root", ["part", "state"], _PART_COLUMNS, [
             (p["name"], p["state"], p) for p in metrics["parts"]
         ]),
@@ -62,9 +63,9 @@ def _known(values: dict[str, Any]) -> list[bool]:
 
 
 def _table(title: str, names: list[str], columns: dict[str, str], rows: list[tuple]) -> Table:
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     for name in names:
-        table.add_column(name)
+        table.add_column(name, no_wrap=True)
     for header in columns.values():
         table.add_column(header, justify="right")
     for *labels, values in rows:
@@ -80,6 +81,6 @@ def _shown(value: Any) -> str:
         case bool():
             return "yes" if value else "no"
         case float():
-            return f"{value:.4g}"
+            return f"{value:.3g}"
         case _:
             return str(value)

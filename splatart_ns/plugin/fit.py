@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
 import platform
 import resource
@@ -22,6 +23,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from splatart_ns.bundle import load_bundle
 from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.check import require_valid
 from splatart_ns.errors import InputError
@@ -66,12 +68,13 @@ class Settings:
 
 
 class Report:
-    """report.json: which stages have finished, and what they took. Written after each stage."""
+    """report.json: which stages have finished, and what they took. Written before and after each stage."""
 
-    def __init__(self, path: Path, capture: Path, settings: Settings):
+    def __init__(self, path: Path, capture: Capture, settings: Settings):
         self.path = path
         self.data: dict[str, Any] = {
-            "capture": str(capture),
+            "capture": str(capture.path.absolute()),
+            "capture_sha256": _digest(capture),
             "settings": asdict(settings),
             "seed": settings.seed,
             "device": "cuda: " + torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
@@ -80,26 +83,55 @@ class Report:
             "versions": {"python": platform.python_version()}
             | {name: version(name) for name in ("splatart-ns", "nerfstudio", "torch", "gsplat", "numpy")},
             "stages": [],
+            "seconds": 0.0,
         }
-        if path.exists():
-            try:
-                earlier = json.loads(path.read_text())
-                same = all(earlier[key] == self.data[key] for key in ("capture", "settings"))
-                stages = earlier["stages"] if same else []
-            except (ValueError, KeyError, TypeError):
-                raise InputError(
-                    f"{path} is not a report of `splatart fit`; remove it or choose another folder."
-                ) from None
-            self.data["stages"] = stages
+        self._earlier = self._read_stages() if path.exists() else []
 
-    def finished(self, stage: str) -> bool:
-        return any(entry["name"] == stage for entry in self.data["stages"])
+    def _read_stages(self) -> list[dict[str, Any]]:
+        """What an earlier run has finished, when it was of the same capture and settings."""
+        try:
+            earlier = json.loads(self.path.read_text())
+            stages = [
+                {**entry, "name": str(entry["name"]), "seconds": entry["seconds"] + 0.0} for entry in earlier["stages"]
+            ]
+            same = all(earlier.get(key) == self.data[key] for key in ("capture", "capture_sha256", "settings"))
+        except (OSError, ValueError, LookupError, TypeError, AttributeError):
+            raise InputError(
+                f"{self.path} is not a report of `splatart fit`; remove it or choose another --output-dir."
+            ) from None
+        if not same:
+            CONSOLE.print(f"{self.path.parent} holds a fit of another capture or with other settings; starting over.")
+        return stages if same else []
+
+    def resume(self, stage: str, whole: bool) -> bool:
+        """Whether a stage needs no work: it and all before it were finished, and its files are still `whole`."""
+        if whole and self._earlier and self._earlier[0]["name"] == stage:
+            self.data["stages"].append(self._earlier.pop(0))
+            return True
+        self._earlier.clear()
+        self._write()  # before the stage's files change, lest a killed run leaves them with another run's report
+        return False
 
     def add(self, **entry: Any) -> None:
         """Note a finished stage."""
         self.data["stages"].append(entry)
-        self.data["seconds"] = round(sum(e["seconds"] for e in self.data["stages"]), 2)
+        self._write()
+
+    def _write(self) -> None:
+        self.data["seconds"] = round(sum(entry["seconds"] for entry in self.data["stages"]), 2)
         write_json(self.path, self.data)
+
+
+def _digest(capture: Capture) -> str:
+    """Of all that a fit reads of a capture."""
+    digest = hashlib.sha256(repr((capture.parts, capture.length_unit)).encode())
+    for state in capture.states:
+        digest.update(state.name.encode() + (state.points.read_bytes() if state.points else b""))
+        for frame in state.frames:
+            digest.update(repr((frame.name, frame.camera, frame.T_world_camera.tolist(), frame.split)).encode())
+            for file in (frame.image, frame.labels, frame.object_mask, frame.mask, frame.depth):
+                digest.update(file.read_bytes() if file else b"-")
+    return digest.hexdigest()
 
 
 def fit(
@@ -115,7 +147,11 @@ def fit(
         raise InputError(
             f"{capture_path} has no part '{root}'; choose --root from {', '.join(capture.parts.values())}."
         )
+    if not 0 <= seed < 2**32:
+        raise InputError(f"--seed is {seed}; give 0 to {2**32 - 1}.")
     output_dir = output_dir.absolute()
+    settings = Settings(quality, root, seed)
+    report = Report(output_dir / "report.json", capture, settings)
     try:
         (output_dir / "runs").mkdir(parents=True, exist_ok=True)
         probe = output_dir / ".writable"
@@ -124,7 +160,6 @@ def fit(
     except OSError as error:
         raise InputError(f"{output_dir} cannot be written ({error.strerror}); choose another --output-dir.") from None
 
-    report = Report(output_dir / "report.json", capture_path.absolute(), Settings(quality, root, seed))
     effort = EFFORTS[quality]
     semantic_runs = []
     with _progress() as progress:
@@ -133,8 +168,8 @@ def fit(
             semantic_runs.append(_run(f"semantic {state.name}", config, output_dir, state.name, report, progress))
         config = _pose_config(capture, semantic_runs, effort, seed)
         pose_run = _run("pose", config, output_dir, "all", report, progress)
-        config = _joint_config(capture, pose_run, output_dir, root, seed)
-        _run("joint", config, output_dir, "all", report, progress)
+        config = _joint_config(capture, pose_run, output_dir, settings)
+        _run("joint", config, output_dir, "all", report, progress, whole=_is_whole(output_dir))
     return output_dir
 
 
@@ -154,17 +189,28 @@ def _semantic_config(capture: Capture, state: int, effort: Effort, seed: int) ->
 def _pose_config(capture: Capture, semantic_runs: list[Path], effort: Effort, seed: int) -> TrainerConfig:
     config = copy.deepcopy(pose_method.config)
     config.pipeline.semantic_runs = tuple(semantic_runs)
+    config.pipeline.seed = seed
     config.pipeline.model.pose_steps = effort.pose_steps
     config.max_num_iterations = effort.pose_steps + effort.merge_steps
     return _with_data(config, capture, 0, seed)
 
 
-def _joint_config(capture: Capture, pose_run: Path, bundle: Path, root: str | None, seed: int) -> TrainerConfig:
+def _joint_config(capture: Capture, pose_run: Path, bundle: Path, settings: Settings) -> TrainerConfig:
     config = copy.deepcopy(joint_method.config)
     config.bundle_dir = bundle
     config.pipeline.pose_run = pose_run
-    config.pipeline.root = root
-    return _with_data(config, capture, 0, seed)
+    config.pipeline.root = settings.root
+    config.pipeline.seed = settings.seed
+    config.pipeline.settings = asdict(settings)
+    return _with_data(config, capture, 0, settings.seed)
+
+
+def _is_whole(bundle: Path) -> bool:
+    try:
+        load_bundle(bundle)
+    except InputError:
+        return False
+    return True
 
 
 def _with_data(config: TrainerConfig, capture: Capture, state: int, seed: int) -> TrainerConfig:
@@ -177,9 +223,15 @@ def _with_data(config: TrainerConfig, capture: Capture, state: int, seed: int) -
 
 
 def _run(
-    stage: str, config: TrainerConfig, output_dir: Path, experiment: str, report: Report, progress: Progress
+    stage: str,
+    config: TrainerConfig,
+    output_dir: Path,
+    experiment: str,
+    report: Report,
+    progress: Progress,
+    whole: bool = True,
 ) -> Path:
-    """Train one stage, unless the report says that it is done; returns the run's config.yml."""
+    """Train one stage, unless it is done and its results are `whole`; returns the run's config.yml."""
     config.output_dir = output_dir / "runs"
     config.experiment_name = experiment
     config.timestamp = "fit"
@@ -190,7 +242,7 @@ def _run(
     config.steps_per_save = config.max_num_iterations + 1  # at the end only: a stage is repeated as a whole
     run = config.get_base_dir()
     task = progress.add_task(stage, total=config.max_num_iterations)
-    if report.finished(stage):
+    if report.resume(stage, whole and any(run.glob("nerfstudio_models/step-*.ckpt"))):
         progress.update(task, completed=config.max_num_iterations)
         return run / "config.yml"
     shutil.rmtree(run, ignore_errors=True)

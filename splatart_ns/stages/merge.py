@@ -13,9 +13,9 @@ from splatart_ns.geometry.se3 import inverse, matrix_from_quat
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.visibility import shown, visibility
 
-SHOWN = 0.999
+SHOWN = 0.99
 """Gaussians beyond this share of a part's visibility are left out."""
-COVERED = 2.0
+COVERED = 3.0
 """A centre within so many standard deviations of a Gaussian is where that Gaussian already is."""
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.geometry.se3 import from_rotation_translation, skew, so3_exp, transform_points
-from splatart_ns.stages.part_pair import HUBER, PartPair
+from splatart_ns.stages.part_pair import HUBER, PartPair, huber
 
 STEP = 4e-3
 """Forward differences: radians, and part radii."""
@@ -83,11 +83,10 @@ def _normal_equations(pair: PartPair, T: Tensor, n: int) -> _NormalEquations:
         r = difference[0].reshape(-1)
         J = (difference[1:].reshape(n, -1) - r) / STEP
         w = weight[..., None].expand(difference.shape[1:]).reshape(-1)
-        size = r.abs().clamp_min(1e-12)
-        wJ = J * (w * (HUBER / size).clamp_max(1.0))
+        wJ = J * (w * (HUBER / r.abs().clamp_min(1e-12)).clamp_max(1.0))
         H += (wJ @ J.T).double()
         gradients.append((wJ @ r).double())
-        cost += float((w * torch.where(size < HUBER, 0.5 * r * r, HUBER * (size - 0.5 * HUBER))).sum())
+        cost += float((w * huber(r)).sum())
     return _NormalEquations(H, torch.stack(gradients), cost / max(pair.area, 1.0))
 
 
@@ -98,8 +97,8 @@ def motion_covariance(pair: PartPair, T: Tensor) -> Tensor:
     translation is that of the world's origin. A sandwich estimate with views as clusters (Liang and Zeger 1986):
     neighbouring pixels err together (edges, shadows, a mixed Gaussian), so each view counts as one observation, however
     many pixels it has. Views of one state share the other state's Gaussians and err together too: what the two
-    directions disagree by is added. What no image shows (the turn of a plain round part) has the variance of a whole
-    turn: a prior of one half turn, or of 3 radii, keeps the estimate finite.
+    directions disagree by is added. A prior with a standard deviation of half a turn, and of pi radii, keeps finite what
+    no image shows, like the turn of a plain round part about its axis.
     """
     T = T.double()
     equations = _normal_equations(pair, T, 6)

@@ -16,13 +16,13 @@ def test_what_one_state_hides_comes_from_another():
     T = motion((0, 0, 30), (0.0, 0.2, 0.6))
     base = box(1, (0.9, 0.6, 0.3), (0.0, 0.0, -0.3))
     drawer = box(2, (0.6, 0.4, 0.4), (0.0, 0.0, 0.1))
-    lower = drawer.means[:, 2] < -0.05
+    lower = drawer.means[:, 2] < 0.1
     splats = [Splat.cat([base, drawer.select(~lower)]), Splat.cat([base, drawer.transformed(T)])]
     views = [photograph(s) for s in splats]
     merged = merge_parts(splats, views, poses(T))
     assert [int(p) for m in merged for p in m.part_ids.unique()] == [1, 2]
     # The drawer is all there, up to single Gaussians, in the canonical frame, and hardly anything twice.
-    assert torch.cdist(drawer.means, merged[1].means).amin(1).max() < 0.07
+    assert torch.cdist(drawer.means, merged[1].means).amin(1).max() < 0.1
     assert len(merged[1]) < 1.1 * len(drawer)
     assert len(merged[0]) < 1.1 * len(base)
 
@@ -45,13 +45,13 @@ def test_a_part_without_gaussians_stays_empty():
     assert len(merged[1]) == 0
 
 
-def test_covered_means_within_two_standard_deviations():
+def test_a_point_is_covered_within_three_standard_deviations():
     splat = box(1, (0.1, 0.1, 0.1), (0.0, 0.0, 0.0), spacing=0.2).select(torch.tensor([0]))
     splat.means[:] = 0
     splat.log_scales = torch.tensor([[0.5, 0.1, 0.1]]).log()
-    points = torch.tensor([[0.9, 0, 0], [1.1, 0, 0], [0, 0.19, 0], [0, 0.25, 0]])
+    points = torch.tensor([[1.4, 0, 0], [1.6, 0, 0], [0, 0.29, 0], [0, 0.35, 0]])
     assert covered(points, splat, 0.0).tolist() == [True, False, True, False]
-    assert covered(points, splat, 0.2).tolist() == [True, False, True, True]
+    assert covered(points, splat, 0.1).tolist() == [True, False, True, True]
 
 
 def test_visibility_is_the_share_of_the_image():

@@ -118,7 +118,7 @@ def test_descent_on_the_losses_finds_the_pose():
     frozen = torch.tensor([[True, True], [True, False]])
     p = PartPoses(base, *part_extents(splats[0], 2), frozen)
     optimizer = torch.optim.Adam(p.parameters(), lr=1e-2)
-    steps = 120
+    steps = 90
     for k in range(steps):
         optimizer.param_groups[0]["lr"] = 1e-2 * 0.05 ** (k / steps)
         source, target = (0, 1) if k % 2 == 0 else (1, 0)
