@@ -46,7 +46,7 @@ method = MethodSpecification(
                 densify_grad_thresh=2e-4,
             ),
         ),
-        # Rates for a world in which the object has a radius of about 1 (POSES.md, section 7).
+        # Rates for a world in which the object has a radius of about 1.
         optimizers={
             "means": _adam(1.2e-3, 0.02),
             "scales": _adam(1e-2),

@@ -62,7 +62,7 @@ class Joint:
 
 @dataclass
 class Bundle:
-    """What `splatart fit` leaves: DESIGN section 5, with the Gaussians loaded."""
+    """What `splatart fit` leaves, with the Gaussians loaded."""
 
     parts: list[Part]
     """In order of id."""

@@ -1,4 +1,4 @@
-"""How far the reconstructed shapes are from the true ones (METRICS.md, Geometry)."""
+"""How far the reconstructed shapes are from the true ones (docs/metrics.md, geometry)."""
 
 from __future__ import annotations
 

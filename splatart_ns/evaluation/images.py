@@ -1,4 +1,4 @@
-"""How well the object is rendered from views that were never trained on (METRICS.md, Images)."""
+"""How well the object is rendered from views that were never trained on (docs/metrics.md, images)."""
 
 from __future__ import annotations
 

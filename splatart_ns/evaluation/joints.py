@@ -1,4 +1,4 @@
-"""How far estimated joints are from the true ones (METRICS.md, Joints)."""
+"""How far estimated joints are from the true ones (docs/metrics.md, joints)."""
 
 from __future__ import annotations
 

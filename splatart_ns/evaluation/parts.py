@@ -1,4 +1,4 @@
-"""How far the estimated part poses are from the true ones (METRICS.md, Part poses)."""
+"""How far the estimated part poses are from the true ones (docs/metrics.md, part poses)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the right parts hang together (METRICS.md, Structure)."""
+"""Whether the right parts hang together (docs/metrics.md, structure)."""
 
 from __future__ import annotations
 

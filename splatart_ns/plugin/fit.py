@@ -258,12 +258,16 @@ def _run(
     )
     trainer.train()
     progress.update(task, completed=config.max_num_iterations)
+    notes = getattr(trainer.pipeline, "notes", [])
+    for note in notes:
+        progress.console.print(note, markup=False, soft_wrap=True)
     report.add(
         name=stage,
         seconds=round(time.perf_counter() - start, 2),
         iterations=config.max_num_iterations,
         gaussians=trainer.pipeline.model.num_points,
         peak_memory_mb=_peak_memory_mb(),
+        notes=notes,
     )
     return run / "config.yml"
 

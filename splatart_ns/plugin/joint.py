@@ -235,8 +235,9 @@ class JointPipeline(VanillaPipeline):
             epsilon=config.epsilon,
             method=config.method,
         )
-        for part, reason in self.tree.unattached.items():
-            CONSOLE.log(f"{capture.parts[part]}: {reason}")
+        self.notes = [f"{capture.parts[part]}: {reason}" for part, reason in self.tree.unattached.items()]
+        for note in self.notes:
+            CONSOLE.log(note)
         self.model.start(splat, self.tree, motions, normalization)
         self.bundle: Bundle = assemble_bundle(
             self.tree,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -15,9 +15,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from splatart_ns.bundle.motion_file import read_motions
+from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.view import View, load_views
 from splatart_ns.errors import InputError
-from splatart_ns.plugin.compat import read_checkpoint, read_run_config
+from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_config
 from splatart_ns.plugin.gaussians import gauss_params_from_splat, splat_from_state
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.rasterize.render import render
@@ -117,11 +118,13 @@ class PosePipeline(VanillaPipeline):
 
     def __init__(self, config: PosePipelineConfig, device: str, test_mode: str = "val", *args, **kwargs):
         super().__init__(config, device, test_mode, *args, **kwargs)
+        self.notes: list[str] = []
         if test_mode != "val":  # a checkpoint brings everything
             return
         capture = self.datamanager.capture
         self.views: list[list[View]] = [
-            [v.to(device) for v in load_views(capture, s, "train")] for s in range(len(capture.states))
+            [v.to(device) for view in load_views(capture, s, "train") if (v := with_silhouette(view)) is not None]
+            for s in range(len(capture.states))
         ]
         runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
         splats = [self._load_splat(run).to(device) for run in runs]
@@ -158,7 +161,8 @@ class PosePipeline(VanillaPipeline):
                 motion = initial_motion(*pair, p + 1, self.config.seed)
                 name = f"part {self.model.part_names[p + 1]}, state {s}"
                 if not motion.found:
-                    CONSOLE.log(f"{name}: too few Gaussians to register; it is held still")
+                    self.notes.append(f"{name}: too few Gaussians to find its pose; it is held still.")
+                    CONSOLE.log(self.notes[-1])
                 base[s, p] = motion.T.cpu()
                 frozen[s, p] = not motion.found or (self.config.snap and motion.still)
         return base, frozen
@@ -261,21 +265,31 @@ class PosePipeline(VanillaPipeline):
         return {**super().get_param_groups(), "part_poses": list(self.model.poses.parameters())}
 
 
+def with_silhouette(view: View) -> View | None:
+    """The view with an alpha, for opaque images from their labels; None for one that has neither.
+
+    The parts are rendered without what surrounds them, so an image must say where the object ends.
+    """
+    if view.alpha is not None or view.labels is None:
+        return None if view.alpha is None else view
+    alpha = 255 * ((view.labels > 0) & (view.labels != UNLABELLED)).to(torch.uint8)
+    counts = view.labels != UNLABELLED
+    return replace(view, alpha=alpha, mask=counts if view.mask is None else view.mask & counts)
+
+
 def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
-    """The latest splatart-semantic run of each state under outputs/.
+    """The config.yml of the latest finished splatart-semantic run of each state under outputs/.
 
     Raises:
         InputError: naming a state that has none.
     """
-    folder = Path("outputs") / capture.name / "splatart-semantic"
     found: dict[int, Path] = {}
-    for config in sorted(folder.glob("*/config.yml"), key=lambda p: p.stat().st_mtime):
-        if list((config.parent / "nerfstudio_models").glob("step-*.ckpt")):
-            found[read_run_config(config)["pipeline"]["datamanager"]["dataparser"]["state"]] = config
+    for config in finished_runs(capture, "splatart-semantic"):
+        found[read_run_config(config)["pipeline"]["datamanager"]["dataparser"]["state"]] = config
     for state in range(num_states):
         if state not in found:
             raise InputError(
-                f"{folder} holds no finished run of state {state}; run `ns-train splatart-semantic --data {capture} "
-                f"splatart-capture --state {state}` first."
+                f"outputs/ holds no finished splatart-semantic run of state {state} of {capture}; run "
+                f"`ns-train splatart-semantic --data {capture} splatart-capture --state {state}` first."
             )
     return tuple(found[s] for s in range(num_states))

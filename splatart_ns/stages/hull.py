@@ -13,7 +13,7 @@ from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.view import View
 
 MIN_POINTS_PER_PART = {2: 2000, 6: 1000}
-"""Least number of points of a part, by the number of parts up to which it holds (POSES.md, section 7)."""
+"""Least number of points of a part, by the number of parts up to which it holds."""
 MIN_POINTS_OTHERWISE = 350
 
 
@@ -82,7 +82,7 @@ def seed_points(
     """`count` points inside the visual hull, parts below a least number filled up; None without a hull.
 
     Every view needs its alpha. A point's part is the label that most labelled views give it, its colour the mean over
-    the views in which it has that label. The least number keeps small parts from starving (POSES.md, section 1).
+    the views in which it has that label. The least number keeps small parts from starving: a finger of a robot would get a dozen points otherwise.
     """
     hull = visual_hull(views, resolution)
     if hull is None:

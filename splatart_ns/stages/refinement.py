@@ -97,8 +97,8 @@ def motion_covariance(pair: PartPair, T: Tensor) -> Tensor:
     translation is that of the world's origin. A sandwich estimate with views as clusters (Liang and Zeger 1986):
     neighbouring pixels err together (edges, shadows, a mixed Gaussian), so each view counts as one observation, however
     many pixels it has. Views of one state share the other state's Gaussians and err together too: what the two
-    directions disagree by is added. A prior with a standard deviation of half a turn, and of pi radii, keeps finite what
-    no image shows, like the turn of a plain round part about its axis.
+    directions disagree by is added. A prior with a standard deviation of half a turn, and of pi radii, keeps finite
+    what no image shows, like the turn of a plain round part about its axis.
     """
     T = T.double()
     equations = _normal_equations(pair, T, 6)
