@@ -82,7 +82,8 @@ def seed_points(
     """`count` points inside the visual hull, parts below a least number filled up; None without a hull.
 
     Every view needs its alpha. A point's part is the label that most labelled views give it, its colour the mean over
-    the views in which it has that label. The least number keeps small parts from starving: a finger of a robot would get a dozen points otherwise.
+    the views in whose silhouette it falls. The least number keeps small parts from starving: a finger of a robot would
+    get a dozen points otherwise.
     """
     hull = visual_hull(views, resolution)
     if hull is None:
