@@ -175,7 +175,7 @@ def synth(
     CONSOLE.print(f"Capture: {output_dir}")
 
 
-def demo(output_dir: Path = Path("demo"), object: Literal[OBJECTS] = "hinge", quality: Quality = "draft") -> None:
+def demo(output_dir: Path = Path("demo"), object: Literal[OBJECTS] = "hinge", quality: Quality = "standard") -> None:
     """Make a capture of a built-in object, fit it, compare it with the truth and render a sweep. No download.
 
     Args:

@@ -215,7 +215,7 @@ class JointPipeline(VanillaPipeline):
         motions = torch.from_numpy(normalization.motion_to_world(base.numpy()))
         covariances = covariances_to_world(state["_model.covariance"], normalization)
         present = [p for p in capture.parts if bool((ids == p).any())]
-        points = {p: world.means[(ids == p) & (world.opacities > MIN_POINT_OPACITY)].double() for p in present}
+        points = {p: surface_points(world.select(ids == p)) for p in present}
         held = state["_model.held_ratio"]
         ratios = {
             (a, b): float(held[a - 1, b - 1])
@@ -249,6 +249,12 @@ class JointPipeline(VanillaPipeline):
             capture.length_unit,
             {"version": version("splatart-ns"), "seed": config.seed, "settings": config.settings},
         )
+
+
+def surface_points(splat: Splat) -> Tensor:
+    """Means [N, 3] float64 of the Gaussians that say where the surface is: the opaque ones, and at least half."""
+    opacities = splat.opacities
+    return splat.means[opacities >= opacities.median().clamp(max=MIN_POINT_OPACITY)].double()
 
 
 def splat_to_world(splat: Splat, normalization: Normalization) -> Splat:

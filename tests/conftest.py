@@ -1,0 +1,63 @@
+"""A tiny capture and one fit of it, made once by the real commands and shared by all tests."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from splatart_ns.capture.procedural import synthesize_object
+from splatart_ns.capture.synthesis import SynthesisOptions
+
+COMMAND = [sys.executable, "-c", "from splatart_ns.cli import main; main()"]
+
+
+@pytest.fixture(scope="session")
+def start_splatart() -> Callable[..., subprocess.Popen]:
+    """Starts `splatart` with these arguments as a process of its own."""
+
+    def start(*arguments: object) -> subprocess.Popen:
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
+        pipe = subprocess.PIPE
+        return subprocess.Popen([*COMMAND, *map(str, arguments)], stdout=pipe, stderr=pipe, text=True, env=environment)
+
+    return start
+
+
+@pytest.fixture
+def run_main(monkeypatch, capsys) -> Callable[..., tuple[int, str, str]]:
+    """Runs `splatart` with these arguments in this process; returns the exit code, stdout and stderr."""
+    from splatart_ns.cli import main
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["splatart", *map(str, arguments)])
+        capsys.readouterr()
+        try:
+            main()
+            code = 0
+        except SystemExit as end:
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def hinge_capture(tmp_path_factory) -> Path:
+    """A capture of the built-in hinge, with ground truth. Not to be changed."""
+    folder = tmp_path_factory.mktemp("hinge") / "capture"
+    return synthesize_object("hinge", folder, SynthesisOptions(train_views=12, test_views=2, resolution=64))
+
+
+@pytest.fixture(scope="session")
+def hinge_fit(hinge_capture, start_splatart, tmp_path_factory) -> Path:
+    """The bundle of a draft fit of `hinge_capture`. Not to be changed."""
+    folder = tmp_path_factory.mktemp("fit") / "bundle"
+    process = start_splatart("fit", hinge_capture, "--output-dir", folder, "--quality", "draft")
+    _, errors = process.communicate()
+    assert process.returncode == 0, errors
+    return folder

@@ -1,0 +1,210 @@
+"""The commands, as a user types them."""
+
+import importlib.metadata
+import json
+import shutil
+
+import imageio
+import numpy as np
+import pytest
+from PIL import Image
+
+from splatart_ns.capture.formats import load_capture
+from splatart_ns.capture.procedural import write_object
+from splatart_ns.capture.synthesis import SynthesisOptions
+
+JOINT = "base_to_lid"
+SMALL = ("--resolution", 48)
+
+
+@pytest.fixture
+def bundle(hinge_fit, tmp_path):
+    """A bundle that a command may write into."""
+    return shutil.copytree(hinge_fit, tmp_path / "bundle", ignore=shutil.ignore_patterns("runs"))
+
+
+@pytest.fixture
+def render(run_main, hinge_fit):
+    def run(output, *arguments):
+        code, _, errors = run_main("render", hinge_fit, "--output", output, *SMALL, *arguments)
+        assert (code, errors) == (0, "")
+        return output
+
+    return run
+
+
+def picture(path):
+    return np.asarray(Image.open(path), dtype=float)
+
+
+def assert_shows_an_object(frame):
+    assert frame.shape == (48, 48, 3)
+    assert (frame[0, 0] == 255).all()
+    assert 0.05 < (frame.min(axis=2) < 240).mean() < 0.95
+
+
+def test_the_console_script_is_this_command():
+    (script,) = importlib.metadata.entry_points(group="console_scripts", name="splatart")
+    assert script.value == "splatart_ns.cli:main"
+
+
+def test_help_names_every_command(start_splatart):
+    process = start_splatart("--help")
+    output, errors = process.communicate()
+    assert (process.returncode, errors) == (0, "")
+    assert all(f"• {command} " in output for command in ("fit", "render", "eval", "check", "synth", "demo"))
+
+
+def test_check_has_nothing_to_say_about_a_sound_capture(run_main, hinge_capture):
+    assert run_main("check", hinge_capture) == (0, "0 errors, 0 warnings\n", "")
+
+
+def test_check_tells_all_problems(run_main, hinge_capture, tmp_path):
+    capture = shutil.copytree(hinge_capture, tmp_path / "capture")
+    (capture / "state_00/images/0001.png").unlink()
+    (capture / "state_01/images/0004.png").write_bytes(b"no picture")
+    code, output, errors = run_main("check", capture)
+    assert code == 2 and errors == ""
+    first, second, last = output.splitlines()
+    assert first.startswith(f"error: {capture / 'state_00/images/0001.png'}: the file does not exist; ")
+    assert second.startswith(f"error: {capture / 'state_01/images/0004.png'}: ")
+    assert last == "2 errors, 0 warnings"
+
+
+def test_eval_writes_all_metrics(run_main, bundle, hinge_capture):
+    code, output, _ = run_main("eval", bundle, "--data", hinge_capture)
+    assert code == 0
+    assert "lid" in output and "tree_exact: yes" in output
+    metrics = json.loads((bundle / "metrics.json").read_text())
+    layout = {"joints", "joints_mean", "structure", "parts", "geometry", "images", "speed", "notes"}
+    assert set(metrics) == layout
+    (joint,) = metrics["joints"]
+    assert (joint["child"], joint["parent"], joint["type"]) == ("lid", "base", "revolute")
+    assert joint["type_correct"] and joint["parent_correct"] and joint["covered_95"] in (True, False)
+    for key in ("axis_angle", "axis_position", "pivot_offset", "motion_geodesic", "motion_value", "displacement"):
+        assert metrics["joints_mean"]["revolute"][key] == joint[key] < 3
+    assert metrics["structure"] == {"tree_exact": True, "edges_precision": 1.0, "edges_recall": 1.0}
+    assert {(p["name"], p["state"]) for p in metrics["parts"]} == {("lid", "state_01")}
+    assert all(p["part_rotation"] < 3 and p["part_translation"] < 0.02 for p in metrics["parts"])
+    assert set(metrics["geometry"]) == {"mesh", "centres"}
+    assert {"CD-s", "CD-m", "CD-w"} <= set(metrics["geometry"]["centres"])
+    assert set(metrics["images"]) == {"state_00", "state_01", "novel_00"}
+    for scores in metrics["images"].values():
+        assert {"psnr", "ssim", "lpips", "accumulation_l1", "part_iou"} <= set(scores)
+        assert scores["psnr"] > 18 and scores["part_iou"] > 0.7
+        assert scores["lpips"] is None and any("lpips" in note for note in metrics["notes"])
+    assert metrics["speed"] == json.loads((bundle / "report.json").read_text())
+
+
+def test_render_without_options_shows_state_0(render, tmp_path):
+    assert [f.name for f in render(tmp_path / "frames").iterdir()] == ["frame_0000.png"]
+    assert_shows_an_object(picture(tmp_path / "frames/frame_0000.png"))
+
+
+def test_render_sets_joints(render, tmp_path):
+    def shown(folder, *arguments):
+        return picture(render(tmp_path / folder, *arguments) / "frame_0000.png")
+
+    at_rest = shown("rest", "--azimuth", 60)
+    turned = shown("degrees", "--azimuth", 60, "--set", f"{JOINT}=40deg")
+    assert np.abs(at_rest - turned).mean() > 2
+    assert (shown("zero", "--azimuth", 60, "--set", f"{JOINT}=0") == at_rest).all()
+    assert np.abs(shown("radians", "--azimuth", 60, "--set", f"{JOINT}={np.radians(40)}") - turned).max() <= 1
+
+
+def test_every_set_counts(run_main, hinge_fit, tmp_path):
+    code, _, errors = run_main(
+        "render", hinge_fit, "--output", tmp_path / "frames", "--set", "nothing=1", "--set", f"{JOINT}=1"
+    )
+    assert code == 2 and "'nothing'" in errors
+    code, _, errors = run_main("render", hinge_fit, "--output", tmp_path / "frames", "--set", f"{JOINT}=1", "nothing=1")
+    assert code == 2 and "'nothing'" in errors
+
+
+def test_a_sweep_moves_the_joint_there_and_back(render, tmp_path):
+    folder = render(tmp_path / "frames", "--sweep", "--frames", 6)
+    frames = [picture(folder / f"frame_{i:04d}.png") for i in range(6)]
+    assert len(list(folder.iterdir())) == 6
+    for frame in frames:
+        assert_shows_an_object(frame)
+    changes = [np.abs(frame - frames[0]).mean() for frame in frames]
+    assert changes[3] == max(changes) > 2
+    assert changes[1] == pytest.approx(changes[5], abs=0.1)
+    assert 0 < changes[1] < changes[2] < changes[3]
+
+
+def test_a_trajectory_is_followed_row_by_row(render, tmp_path):
+    file = tmp_path / "q.csv"
+    file.write_text(f"{JOINT}\n0\n0.6\n40deg\n0\n")
+    folder = render(tmp_path / "frames", "--trajectory", file)
+    frames = [picture(folder / f"frame_{i:04d}.png") for i in range(4)]
+    assert len(list(folder.iterdir())) == 4
+    assert (frames[0] == frames[3]).all()
+    assert np.abs(frames[0] - frames[1]).mean() > 2
+    assert np.abs(frames[1] - frames[2]).mean() > 0.2
+
+
+def test_render_writes_a_gif(render, tmp_path):
+    path = render(tmp_path / "sweep.gif", "--sweep", "--frames", 5, "--fps", 10)
+    with Image.open(path) as film:
+        assert (film.n_frames, film.size, film.info["duration"]) == (5, (48, 48), 100)
+    assert [f.name for f in tmp_path.iterdir()] == ["sweep.gif"]
+
+
+def test_render_writes_an_mp4(render, tmp_path):
+    path = render(tmp_path / "sweep.mp4", "--sweep", "--frames", 5, "--fps", 10)
+    frames = list(imageio.get_reader(path, "ffmpeg").iter_data())
+    assert [frame.shape for frame in frames] == [(48, 48, 3)] * 5
+    assert np.abs(frames[0].astype(float) - frames[2]).mean() > 2
+    assert [f.name for f in tmp_path.iterdir()] == ["sweep.mp4"]
+
+
+def test_render_looks_through_a_camera_of_the_capture(render, hinge_capture, tmp_path):
+    shown = picture(render(tmp_path / "frames", "--data", hinge_capture, "--camera", 12) / "frame_0000.png")
+    rgba = np.asarray(Image.open(hinge_capture / "state_00/images/0012.png"), dtype=float)
+    alpha = rgba[..., 3:] / 255
+    true = alpha * rgba[..., :3] + (1 - alpha) * 255
+    assert shown.shape == true.shape
+    assert -10 * np.log10(((shown - true) ** 2).mean() / 255**2) > 18
+
+
+@pytest.mark.parametrize("channel", ["depth", "accumulation", "parts"])
+def test_render_shows_other_channels(render, tmp_path, channel):
+    arguments = ("--channel", channel, "--background", 0, 0, 0)
+    frame = picture(render(tmp_path / "frames", *arguments) / "frame_0000.png")
+    assert (frame[0, 0] == 0).all()
+    assert frame.max() > 200
+    grey = (np.ptp(frame, axis=2) < 2).all()
+    assert grey == (channel == "accumulation")
+
+
+def test_synth_renders_a_robot_and_its_own_objects(start_splatart, run_main, tmp_path):
+    urdf = write_object("drawer", tmp_path / "robot")
+    options = ("--train-views", 3, "--test-views", 1, "--resolution", 16)
+    process = start_splatart("synth", urdf, "--output-dir", tmp_path / "a", *options)
+    _, errors = process.communicate()
+    assert (process.returncode, errors) == (0, "")
+    assert run_main("synth", "drawer", "--output-dir", tmp_path / "b", *options)[0] == 0
+    for name in ("a", "b"):
+        capture = load_capture(tmp_path / name)
+        assert list(capture.parts.values()) == ["body", "drawer"]
+        assert [len(state.frames) for state in capture.states] == [4, 4]
+        assert {frame.camera.width for state in capture.states for frame in state.frames} == {16}
+        assert (tmp_path / name / "ground_truth.json").is_file()
+
+
+def test_demo_goes_from_nothing_to_a_film(run_main, monkeypatch, hinge_fit, tmp_path):
+    """With the fit itself, which has tests of its own, replaced by a finished one."""
+
+    def fit(capture, output_dir, quality, root, seed):
+        assert quality == "draft" and (capture / "ground_truth.json").is_file()
+        return shutil.copytree(hinge_fit, output_dir, dirs_exist_ok=True)
+
+    monkeypatch.setattr("splatart_ns.plugin.fit.fit", fit)
+    monkeypatch.setattr(
+        "splatart_ns.cli.SynthesisOptions", lambda **_: SynthesisOptions(train_views=3, test_views=1, resolution=16)
+    )
+    code, output, _ = run_main("demo", "--output-dir", tmp_path / "demo")
+    assert code == 0
+    assert sorted(f.name for f in (tmp_path / "demo").iterdir()) == ["bundle", "capture", "sweep.gif"]
+    assert (tmp_path / "demo/bundle/metrics.json").is_file()

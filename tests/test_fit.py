@@ -1,0 +1,168 @@
+"""`splatart fit`: what it leaves, and that it goes on where it was ended."""
+
+import json
+import math
+import shutil
+import signal
+import time
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from splatart_ns.bundle import load_bundle
+
+STAGES = ["semantic state_00", "semantic state_01", "pose", "joint"]
+RUNS = ["state_00/splatart-semantic", "state_01/splatart-semantic", "all/splatart-pose", "all/splatart-joint"]
+
+
+@pytest.fixture
+def fit_copy(hinge_fit, tmp_path):
+    return shutil.copytree(hinge_fit, tmp_path / "bundle")
+
+
+def contents(folder):
+    """Every file's bytes and time of change."""
+    return {f.relative_to(folder): (f.read_bytes(), f.stat().st_mtime_ns) for f in folder.rglob("*") if f.is_file()}
+
+
+def results(folder):
+    """The bytes of what a fit is for."""
+    return {f.relative_to(folder): f.read_bytes() for f in [folder / "articulation.json", *folder.glob("parts/*")]}
+
+
+def finished_stages(folder):
+    report = folder / "report.json"
+    return [stage["name"] for stage in json.loads(report.read_text())["stages"]] if report.exists() else []
+
+
+def test_the_bundle_is_complete(hinge_fit):
+    bundle = load_bundle(hinge_fit)
+    assert [(part.id, part.name) for part in bundle.parts] == [(1, "base"), (2, "lid")]
+    assert bundle.states == ["state_00", "state_01"]
+    assert bundle.length_unit == "metre"
+    assert sorted(f.name for f in (hinge_fit / "parts").iterdir()) == ["base.ply", "lid.ply"]
+    assert all(len(part.splat) > 100 for part in bundle.parts)
+    assert bundle.provenance["seed"] == 0
+    assert bundle.provenance["settings"] == {"quality": "draft", "root": None, "seed": 0}
+    assert sorted(f.name for f in hinge_fit.iterdir()) == ["articulation.json", "parts", "report.json", "runs"]
+
+
+def test_the_joint_is_the_true_one(hinge_fit, hinge_capture):
+    (true,) = json.loads((hinge_capture / "ground_truth.json").read_text())["joints"]
+    (joint,) = load_bundle(hinge_fit).joints
+    assert (joint.type, joint.parent, joint.child, joint.in_tree) == ("revolute", "base", "lid", True)
+    axis, origin = (torch.tensor(true[key], dtype=torch.float64) for key in ("axis", "origin"))
+    cosine = float(joint.axis @ axis)
+    assert math.degrees(math.acos(min(abs(cosine), 1))) < 3
+    assert float(torch.linalg.cross(joint.origin - origin, axis).norm()) < 0.01
+    turned = true["values"][1] - true["values"][0]
+    assert abs(float(joint.values[1]) * math.copysign(1, cosine) - turned) < math.radians(3)
+
+
+def test_the_report_tells_what_every_stage_took(hinge_fit):
+    report = json.loads((hinge_fit / "report.json").read_text())
+    assert [stage["name"] for stage in report["stages"]] == STAGES
+    for stage in report["stages"]:
+        assert all(stage[key] > 0 for key in ("seconds", "iterations", "gaussians", "peak_memory_mb"))
+    assert report["seconds"] == pytest.approx(sum(stage["seconds"] for stage in report["stages"]), abs=0.01)
+    assert report["settings"] == {"quality": "draft", "root": None, "seed": 0}
+    assert {"python", "torch", "nerfstudio", "splatart-ns"} <= set(report["versions"])
+    assert report["stages"][-1]["gaussians"] == sum(len(part.splat) for part in load_bundle(hinge_fit).parts)
+
+
+@pytest.mark.parametrize("stage", range(4))
+def test_nerfstudio_opens_the_runs(hinge_fit, stage):
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    config = hinge_fit / "runs" / RUNS[stage] / "fit/config.yml"
+    _, pipeline, checkpoint, _ = eval_setup(config)
+    assert checkpoint.parent.parent == config.parent
+    report = json.loads((hinge_fit / "report.json").read_text())
+    assert pipeline.model.num_points == report["stages"][stage]["gaussians"]
+    camera = pipeline.datamanager.eval_dataset.cameras[:1]
+    assert float(pipeline.model.get_outputs_for_camera(camera)["accumulation"].max()) > 0.9
+
+
+def test_an_interrupted_fit_ends_like_an_uninterrupted_one(hinge_fit, hinge_capture, start_splatart, tmp_path):
+    """A fit of the same seed in another folder, ended in the middle of every stage, has the same bytes at the end."""
+    bundle = tmp_path / "bundle"
+    arguments = ("fit", hinge_capture, "--output-dir", bundle, "--quality", "draft")
+    for stage, sign in enumerate([signal.SIGKILL, signal.SIGINT, signal.SIGKILL]):
+        process = start_splatart(*arguments)
+        while process.poll() is None and finished_stages(bundle) != STAGES[:stage]:
+            time.sleep(0.02)
+        while (
+            process.poll() is None and not (bundle / "runs" / RUNS[stage] / "fit/dataparser_transforms.json").exists()
+        ):
+            time.sleep(0.02)
+        time.sleep(0.5)
+        process.send_signal(sign)
+        _, errors = process.communicate()
+        assert finished_stages(bundle) == STAGES[:stage]
+        assert not (bundle / "articulation.json").exists()
+        if sign == signal.SIGINT:
+            assert process.returncode == 130
+            assert errors.startswith("Interrupted. ") and errors.count("\n") == 1
+        else:
+            assert process.returncode == -sign
+
+    process = start_splatart(*arguments)
+    _, errors = process.communicate()
+    assert (process.returncode, errors) == (0, "")
+    assert finished_stages(bundle) == STAGES
+    assert results(bundle) == results(hinge_fit)
+
+
+def test_a_finished_fit_is_left_alone(fit_copy, hinge_capture, run_main):
+    before = contents(fit_copy)
+    assert run_main("fit", hinge_capture, "--output-dir", fit_copy, "--quality", "draft")[0] == 0
+    assert contents(fit_copy) == before
+
+
+def test_a_damaged_bundle_is_written_again(fit_copy, hinge_fit, hinge_capture, run_main):
+    (fit_copy / "articulation.json").write_text("{")
+    (fit_copy / "parts/lid.ply").unlink()
+    assert run_main("fit", hinge_capture, "--output-dir", fit_copy, "--quality", "draft")[0] == 0
+    assert results(fit_copy) == results(hinge_fit)
+
+
+class TestResuming:
+    """What of an earlier run counts."""
+
+    @pytest.fixture
+    def report(self):
+        from splatart_ns.capture.formats import load_capture
+        from splatart_ns.plugin.fit import Report, Settings
+
+        def make(bundle, capture, quality="draft", root=None, seed=0):
+            return Report(bundle / "report.json", load_capture(capture), Settings(quality, root, seed))
+
+        return make
+
+    def test_all_stages_of_the_same_fit(self, report, fit_copy, hinge_capture):
+        again = report(fit_copy, hinge_capture)
+        assert all(again.resume(stage, whole=True) for stage in STAGES)
+
+    @pytest.mark.parametrize("other", [{"seed": 1}, {"quality": "high"}, {"root": "lid"}])
+    def test_none_with_other_settings(self, report, fit_copy, hinge_capture, other):
+        assert not report(fit_copy, hinge_capture, **other).resume(STAGES[0], whole=True)
+        assert finished_stages(fit_copy) == []
+
+    def test_none_of_a_capture_that_was_changed(self, report, fit_copy, hinge_capture, tmp_path):
+        changed = shutil.copytree(hinge_capture, tmp_path / "changed")
+        file = fit_copy / "report.json"
+        file.write_text(file.read_text().replace(json.dumps(str(hinge_capture)), json.dumps(str(changed))))
+        assert report(fit_copy, changed).resume(STAGES[0], whole=True)
+        labels = changed / "state_01/semantics/0003.png"
+        image = cv2.imread(str(labels), cv2.IMREAD_UNCHANGED)
+        assert cv2.imwrite(str(labels), np.where(image == 2, 0, image).astype(np.uint8))
+        assert not report(fit_copy, changed).resume(STAGES[0], whole=True)
+
+    def test_none_after_one_that_is_done_again(self, report, fit_copy, hinge_capture):
+        again = report(fit_copy, hinge_capture)
+        assert again.resume(STAGES[0], whole=True)
+        assert not again.resume(STAGES[1], whole=False)
+        assert finished_stages(fit_copy) == STAGES[:1]
+        assert not again.resume(STAGES[2], whole=True)
