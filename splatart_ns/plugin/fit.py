@@ -21,7 +21,7 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from splatart_ns.bundle import load_bundle
 from splatart_ns.capture.capture import Capture
@@ -191,6 +191,7 @@ def _pose_config(capture: Capture, semantic_runs: list[Path], effort: Effort, se
     config.pipeline.semantic_runs = tuple(semantic_runs)
     config.pipeline.seed = seed
     config.pipeline.model.pose_steps = effort.pose_steps
+    config.optimizers["part_poses"]["scheduler"].max_steps = effort.pose_steps
     config.max_num_iterations = effort.pose_steps + effort.merge_steps
     return _with_data(config, capture, 0, seed)
 
@@ -286,6 +287,7 @@ def _progress() -> Iterator[Progress]:
     quiet, CONSOLE.quiet = CONSOLE.quiet, True
     try:
         with Progress(
+            SpinnerColumn(),
             TextColumn("{task.description:<24}"),
             BarColumn(),
             TextColumn("{task.completed:.0f}/{task.total:.0f}"),

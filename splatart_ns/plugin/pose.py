@@ -168,6 +168,8 @@ class PosePipeline(VanillaPipeline):
         return base, frozen
 
     def _poses_from_file(self) -> Tensor:
+        if self.config.init_file is None:
+            raise InputError("--pipeline.init is file, but no file is given; name one by --pipeline.init-file.")
         capture = self.datamanager.capture
         motions = read_motions(self.config.init_file, list(capture.parts.values()), len(capture.states))
         return torch.from_numpy(capture.normalization.motion_to_normal(motions.numpy()))

@@ -123,10 +123,9 @@ def test_a_slider_moves_its_part_in_the_viewer(commands: Commands, command: str,
         client = ViewerClient(port, viewer.is_alive)
         slider = client.slider("base_to_lid (degree)")
         assert slider["min"] < slider["value"] < slider["max"]
-        before = client.sharp_frame()
-        seen = len(client.messages)
+        before = client.settled_image()
         client.move(slider, slider["max"])
-        after = client.sharp_frame(seen)
+        after = client.settled_image()
         client.close()
     finally:
         viewer.terminate()

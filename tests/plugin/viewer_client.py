@@ -41,35 +41,39 @@ class ViewerClient:
     def _send(self, message: Message) -> None:
         self.socket.send(msgspec.msgpack.encode(message))
 
-    def wait_for(self, wanted: Callable[[Message], bool], since: int = 0) -> Message:
-        """The first message from number `since` on that is wanted."""
+    def _receive(self) -> list[Message]:
+        """What comes within a second."""
+        assert time.monotonic() < self.deadline, "the viewer did not send what the test waits for"
+        try:
+            packet = msgspec.msgpack.decode(self.socket.recv(timeout=1))
+        except TimeoutError:
+            return []
+        new = packet if isinstance(packet, list) else [packet]
+        self.messages.extend(new)
+        return new
+
+    def wait_for(self, wanted: Callable[[Message], bool]) -> Message:
+        """The first message of all that is wanted."""
+        seen = 0
         while True:
-            for message in self.messages[since:]:
+            for message in self.messages[seen:]:
                 if wanted(message):
                     return message
-            since = len(self.messages)
-            assert time.monotonic() < self.deadline, "the viewer did not send it"
-            try:
-                packet = msgspec.msgpack.decode(self.socket.recv(timeout=1))
-            except TimeoutError:
-                continue
-            self.messages.extend(packet if isinstance(packet, list) else [packet])
+            seen = len(self.messages)
+            self._receive()
 
     def slider(self, label: str) -> Message:
         return self.wait_for(lambda m: m["type"] == "GuiAddSliderMessage" and m["label"] == label)
 
-    def sharp_frame(self, since: int = 0) -> np.ndarray:
-        """The first image [512, 512, 3] at the viewer's full resolution."""
-        frames: list[np.ndarray] = []
-
-        def is_sharp(message: Message) -> bool:
-            if message["type"] != "BackgroundImageMessage":
-                return False
-            frames.append(cv2.imdecode(np.frombuffer(message["rgb_bytes"], np.uint8), cv2.IMREAD_COLOR))
-            return frames[-1].shape[0] == 512
-
-        self.wait_for(is_sharp, since)
-        return frames[-1]
+    def settled_image(self) -> np.ndarray:
+        """The image [512, 512, 3] at full resolution after which no other comes for a second."""
+        frame = None
+        while True:
+            new = [m for m in self._receive() if m["type"] == "BackgroundImageMessage"]
+            if new:
+                frame = cv2.imdecode(np.frombuffer(new[-1]["rgb_bytes"], np.uint8), cv2.IMREAD_COLOR)
+            elif frame is not None and frame.shape[0] == 512:
+                return frame
 
     def move(self, slider: Message, value: float) -> None:
         self._send({"type": "GuiUpdateMessage", "id": slider["id"], "updates": {"value": value}})

@@ -1,0 +1,112 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatart_ns.errors import InputError
+from splatart_ns.plugin.compat import StartView, finished_runs, read_checkpoint, read_run_config
+
+
+def write_run(folder: Path, data: Path, *, finished: bool = True) -> Path:
+    """A run's folder with as much of a config.yml as matters."""
+    parts = "".join(f"\n      - {part}" for part in data.parts)
+    (folder / "nerfstudio_models").mkdir(parents=True)
+    (folder / "config.yml").write_text(
+        "!!python/object:splatart_ns.plugin.joint.JointTrainerConfig\n"
+        "pipeline: !!python/object:a.B\n  datamanager: !!python/object:c.D\n"
+        f"    data: &id001 !!python/object/apply:pathlib.PosixPath{parts}\n"
+        "    dataparser: !!python/object:e.F\n      data: *id001\n      state: 1\n"
+    )
+    if finished:
+        torch.save({"pipeline": {}}, folder / "nerfstudio_models" / "step-000000009.ckpt")
+    return folder / "config.yml"
+
+
+def test_a_run_config_is_read_without_running_what_it_says(tmp_path: Path) -> None:
+    witness = tmp_path / "witness"
+    config = tmp_path / "config.yml"
+    config.write_text(f"!!python/object:a.B\nx: !!python/object/apply:os.system\n- touch {witness}\ny: [1, {{z: 2}}]\n")
+    assert read_run_config(config) == {"x": [f"touch {witness}"], "y": [1, {"z": 2}]}
+    assert not witness.exists()
+
+
+@pytest.mark.parametrize("content", ["", "- 1\n", "a: [1\n", "!!python/name:os.system ''\n"])
+def test_what_is_no_run_config_is_refused(tmp_path: Path, content: str) -> None:
+    config = tmp_path / "config.yml"
+    config.write_text(content)
+    with pytest.raises(InputError, match=r"config\.yml"):
+        read_run_config(config)
+
+
+def test_the_newest_checkpoint_is_read(tmp_path: Path) -> None:
+    config = write_run(tmp_path / "run", tmp_path)
+    # nerfstudio's schedulers leave NumPy scalars beside the tensors.
+    state = {"pipeline": {"a": torch.ones(2)}, "schedulers": {"means": {"_last_lr": [np.float64(0.1)]}}}
+    torch.save(state, config.parent / "nerfstudio_models" / "step-000000119.ckpt")
+    assert torch.equal(read_checkpoint(config)["a"], torch.ones(2))
+
+
+def test_a_missing_or_cut_off_checkpoint_is_told(tmp_path: Path) -> None:
+    config = write_run(tmp_path / "run", tmp_path, finished=False)
+    with pytest.raises(InputError, match="no checkpoint"):
+        read_checkpoint(config)
+    (config.parent / "nerfstudio_models" / "step-000000001.ckpt").write_bytes(b"PK\x03\x04cut off")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_checkpoint(config)
+
+
+def test_finished_runs_are_found_by_their_data_and_in_the_order_of_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    method = Path("outputs/any name/splatart-pose")
+    old = write_run(method / "b", Path("captures/door.v1"))
+    new = write_run(method / "a", tmp_path / "captures" / "door.v1")
+    write_run(method / "c", Path("captures/door.v2"))
+    write_run(method / "d", Path("captures/door.v1"), finished=False)
+    write_run(Path("outputs/door/splatart-joint/e"), Path("captures/door.v1"))
+    os.utime(old, (1, 1))
+    os.utime(new, (2, 2))
+    assert finished_runs(Path("captures/door.v1"), "splatart-pose") == [old, new]
+
+
+def test_an_uncaught_input_error_ends_a_process_with_one_sentence() -> None:
+    code = "from splatart_ns.errors import InputError\nimport splatart_ns.plugin.compat\nraise {}('Mend it.')"
+    ended = subprocess.run([sys.executable, "-c", code.format("InputError")], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (2, "error: Mend it.\n")
+
+
+def test_other_exceptions_keep_their_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        raise ValueError("a bug")
+    except ValueError:
+        sys.excepthook(*sys.exc_info())
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_the_viewer_opens_on_the_whole_object() -> None:
+    class Camera:
+        position = look_at = None
+
+    class Client:
+        camera = Camera()
+
+        def atomic(self):
+            import contextlib
+
+            return contextlib.nullcontext()
+
+    class Viewer:
+        class viser_server:
+            @staticmethod
+            def on_client_connect(callback):
+                callback(Client())
+
+    StartView(np.array([0.0, 0.0, 7.0]))._setup(Viewer())
+    # 75 degrees from top to bottom, in viser's unit of a tenth
+    assert np.linalg.norm(Camera.position) / 10 > 1 / np.sin(np.radians(37.5))
+    assert np.allclose(Client.camera.position, [0, 0, 22]) and np.allclose(Client.camera.look_at, 0)

@@ -1,0 +1,59 @@
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import LABELLED, TRAIN_VIEWS
+
+from splatart_ns.plugin.datamanager import SplatartDatamanager, SplatartDatamanagerConfig
+from splatart_ns.plugin.dataparser import SplatartDataParserConfig
+
+
+def manage(capture: Path, test_mode: str = "val", **settings) -> SplatartDatamanager:
+    config = SplatartDatamanagerConfig(data=capture, dataparser=SplatartDataParserConfig(state=1), **settings)
+    return config.setup(device="cpu", test_mode=test_mode)
+
+
+def test_batches_have_alpha_and_labels_and_frames_without_labels_say_so(capture_dir: Path) -> None:
+    manager = manage(capture_dir)
+    labelled = set()
+    for step in range(TRAIN_VIEWS):
+        _, batch = manager.next_train(step)
+        image, labels = batch["image"], batch["semantics"]
+        assert image.shape == (64, 64, 4) and image.dtype == torch.float32
+        assert labels.shape == (64, 64, 1) and labels.dtype == torch.int64
+        if set(labels.unique().tolist()) != {255}:
+            labelled.add(batch["image_idx"])
+            assert set(labels.unique().tolist()) <= {0, 1, 2}
+            # Labels lie on the object.
+            assert (image[..., 3:][labels > 0] > 0).float().mean() > 0.95
+    assert len(labelled) == LABELLED
+
+
+def test_opaque_images_have_three_channels_and_no_seed_points(opaque_capture_dir: Path) -> None:
+    manager = manage(opaque_capture_dir, seed_gaussians=100)
+    assert manager.next_train(0)[1]["image"].shape == (32, 32, 3)
+    assert "points3D_xyz" not in manager.train_dataparser_outputs.metadata
+
+
+def test_seed_points_lie_inside_every_silhouette(capture_dir: Path) -> None:
+    manager = manage(capture_dir, seed_gaussians=200)
+    xyz = manager.train_dataparser_outputs.metadata["points3D_xyz"]
+    assert 100 < len(xyz) <= 400
+    for i in range(TRAIN_VIEWS):
+        view = manager.train_dataset.get_view(i)
+        seen = xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        u, v = (seen @ view.K.T)[:, :2].T / seen[:, 2]
+        inside = view.alpha[v.long().clamp(0, 63), u.long().clamp(0, 63)] > 0
+        assert inside.float().mean() > 0.95
+
+
+@pytest.mark.parametrize("test_mode", ["test", "inference"])
+def test_no_seed_points_where_a_checkpoint_brings_the_gaussians(capture_dir: Path, test_mode: str) -> None:
+    assert "points3D_xyz" not in manage(capture_dir, test_mode, seed_gaussians=200).train_dataparser_outputs.metadata
+
+
+def test_images_can_be_kept_on_the_cpu_of_a_machine_without_accelerator(capture_dir: Path) -> None:
+    manager = manage(capture_dir, cache_images="cpu", cache_images_type="uint8")
+    assert manager.next_train(0)[1]["image"].dtype == torch.uint8
+    (camera, batch), *rest = manager.fixed_indices_eval_dataloader
+    assert len(rest) == 2 and batch["image"].shape == (64, 64, 4) and camera.width.item() == 64
