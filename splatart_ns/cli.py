@@ -193,7 +193,7 @@ def demo(output_dir: Path = Path("demo"), object: Literal[OBJECTS] = "hinge", qu
         synthesize_object(object, capture, options)
     fit(capture, bundle, quality)
     evaluate(bundle, capture)
-    render(bundle, output_dir / "sweep.gif", sweep=True, frames=40, fps=20, resolution=256)
+    render(bundle, output_dir / "sweep.gif", sweep=True, frames=40, fps=20, resolution=256, azimuth=-50)
     CONSOLE.print(f"Look at {output_dir / 'sweep.gif'}; the bundle is {bundle}")
 
 

@@ -145,9 +145,9 @@ def test_a_trajectory_is_followed_row_by_row(render, tmp_path):
 
 
 def test_render_writes_a_gif(render, tmp_path):
-    path = render(tmp_path / "sweep.gif", "--sweep", "--frames", 5, "--fps", 10)
+    path = render(tmp_path / "sweep.gif", "--sweep", "--frames", 6, "--fps", 10)
     with Image.open(path) as film:
-        assert (film.n_frames, film.size, film.info["duration"]) == (5, (48, 48), 100)
+        assert (film.n_frames, film.size, film.info["duration"]) == (6, (48, 48), 100)
     assert [f.name for f in tmp_path.iterdir()] == ["sweep.gif"]
 
 
@@ -197,7 +197,7 @@ def test_demo_goes_from_nothing_to_a_film(run_main, monkeypatch, hinge_fit, tmp_
     """With the fit itself, which has tests of its own, replaced by a finished one."""
 
     def fit(capture, output_dir, quality, root, seed):
-        assert quality == "draft" and (capture / "ground_truth.json").is_file()
+        assert (capture / "ground_truth.json").is_file()
         return shutil.copytree(hinge_fit, output_dir, dirs_exist_ok=True)
 
     monkeypatch.setattr("splatart_ns.plugin.fit.fit", fit)

@@ -20,10 +20,11 @@ def sh_basis(dirs: Tensor, degree: int) -> Tensor:
     """
     if not 0 <= degree <= 3:
         raise ValueError(f"spherical harmonics of degree {degree}: only 0 to 3 are supported")
-    return torch.cat([_band(dirs, order) for order in range(degree + 1)], -1)
+    return torch.cat([_band(dirs, order) for order in range(degree + 1)]).movedim(0, -1)
 
 
 def _band(dirs: Tensor, order: int) -> Tensor:
+    """Values [2 order + 1, ...] of one band: stacking in front is several times faster."""
     x, y, z = dirs.unbind(-1)
     if order == 0:
         values = [torch.full_like(x, _C0)]
@@ -48,7 +49,7 @@ def _band(dirs: Tensor, order: int) -> Tensor:
             b / 2 * z * (x * x - y * y),
             -a * x * (x * x - 3 * y * y),
         ]
-    return torch.stack(values, -1)
+    return torch.stack(values)
 
 
 def _spread_directions(count: int) -> Tensor:
@@ -62,7 +63,7 @@ def _spread_directions(count: int) -> Tensor:
 
 # Band 3 has 7 functions; a few more directions make the system well conditioned.
 _DIRECTIONS = _spread_directions(10)
-_FROM_VALUES = [torch.linalg.pinv(_band(_DIRECTIONS, order)) for order in range(4)]
+_FROM_VALUES = [torch.linalg.pinv(_band(_DIRECTIONS, order).T) for order in range(4)]
 
 
 def rotate_sh(R: Tensor, sh: Tensor) -> Tensor:
@@ -74,6 +75,6 @@ def rotate_sh(R: Tensor, sh: Tensor) -> Tensor:
     bands = [sh[..., :1, :]]
     dirs = _DIRECTIONS.to(R) @ R  # rows are R^T d
     for order in range(1, math.isqrt(sh.shape[-2])):
-        turned = (_FROM_VALUES[order].to(R) @ _band(dirs, order)).to(sh)
+        turned = (_FROM_VALUES[order].to(R) @ _band(dirs, order).movedim(0, -1)).to(sh)
         bands.append(turned @ sh[..., order**2 : (order + 1) ** 2, :])
     return torch.cat(bands, -2)

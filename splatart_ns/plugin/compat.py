@@ -110,7 +110,7 @@ def _data_of(run: dict[str, Any]) -> Path:
 class StartView(ViewerControl):
     """Shows who connects to the viewer an object of radius 1 about the origin as a whole."""
 
-    DISTANCE = 2.2
+    DISTANCE = 1.8
 
     def __init__(self, direction: np.ndarray):
         self.position = self.DISTANCE * direction / np.linalg.norm(direction)

@@ -8,6 +8,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+LARGEST_RADIUS = 1e9
+"""Radii end here, to fit an int32; pixels."""
+LEAST_QUATERNION = 1e-30
+"""Quaternions of a norm up to this count as the identity; their gradient is 0."""
+
 
 class Projection(NamedTuple):
     """2D Gaussians of C cameras; rows with radius 0 are culled and their other values are not to be used."""
@@ -41,7 +46,7 @@ def project(
 
     Args:
         means: Centres [N, 3], world.
-        quats: Rotations [N, 4], wxyz, of any norm; zero counts as the identity.
+        quats: Rotations [N, 4], wxyz, of any norm; zero, or nearly, counts as the identity.
         scales: Standard deviations [N, 3].
         viewmats: World-to-camera transforms [C, 4, 4], OpenCV axes.
         Ks: Pinhole intrinsics [C, 3, 3], pixels.
@@ -83,25 +88,30 @@ class _Project(torch.autograd.Function):
         R, unit, inverse_norm = _rotation(quats)
         axes = R * scales.T  # [3 (world), 3 (own), N]
         JWRS = (JW[:, :, None] * axes[:, :, None]).sum(1)
+        # In units of the Gaussian's own size in the image fourth powers of it neither overflow nor underflow.
+        size2d = (JWRS.square().sum((0, 1)) + max(eps2d, 1e-12)).sqrt()
+        JWRS = JWRS / size2d
+        eps = eps2d / size2d.square()
         p, q = JWRS
         (pp, qq), pq = JWRS.square().sum(1), (p * q).sum(0)
 
         # det(cov) = |p x q|^2 has no cancellation, where pp qq - pq^2 loses all digits for needles.
         normal = _cross(p, q)
         sharp = normal.square().sum(0)
-        inverse_det = 1 / (sharp + eps2d * (pp + qq) + eps2d**2)
-        conics = torch.stack([qq + eps2d, -pq, pp + eps2d]) * inverse_det
+        inverse_det = 1 / (sharp + eps * (pp + qq) + eps.square())
+        conics = torch.stack([qq + eps, -pq, pp + eps]) * (inverse_det / size2d.square())
         compensations = (sharp * inverse_det).sqrt()
 
-        half_trace = 0.5 * (pp + qq) + eps2d
-        largest = half_trace + (half_trace.square() - 1 / inverse_det).clamp_min(0.01).sqrt()
-        radii = (3 * largest.sqrt()).ceil()
+        half_trace = 0.5 * (pp + qq) + eps
+        spread = (half_trace.square() - 1 / inverse_det).clamp_min(0).sqrt() * size2d.square()
+        largest = half_trace * size2d.square() + spread.clamp_min(0.1)
+        radii = (3 * largest.sqrt()).ceil().clamp_max(LARGEST_RADIUS)
         inside = ((means2d + radii > 0) & (means2d - radii < size)).all(0)
         radii = radii.where(in_range & inside & (radii > radius_clip), 0).int()
 
-        ctx.eps2d = eps2d
+        ctx.eps = eps
         ctx.save_for_backward(means, scales, viewmats, focal, inverse, in_range, slope, limited, JW, R, unit)
-        ctx.intermediates = inverse_norm, JWRS, normal, sharp, inverse_det, conics, compensations
+        ctx.intermediates = inverse_norm, JWRS, size2d, normal, sharp, inverse_det, conics, compensations
         ctx.mark_non_differentiable(radii)
         means2d, conics = (x.permute(1, 2, 0).contiguous() for x in (means2d, conics))
         return radii, means2d, depths.contiguous(), conics, compensations.clone()
@@ -110,20 +120,22 @@ class _Project(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, _, v_means2d, v_depths, v_conics, v_compensations):
         means, scales, viewmats, focal, inverse, in_range, slope, limited, JW, R, unit = ctx.saved_tensors
-        inverse_norm, JWRS, normal, sharp, inverse_det, conics, compensations = ctx.intermediates
+        inverse_norm, JWRS, size2d, normal, sharp, inverse_det, conics, compensations = ctx.intermediates
         W = viewmats[:, :3, :3].permute(1, 2, 0)[..., None]
         p, q = JWRS
 
-        # conics = (qq + eps, -pq, pp + eps) / det and compensation^2 = sharp / det.
+        # conics = (qq + eps, -pq, pp + eps) / det / size2d^2 and compensation^2 = sharp / det.
         v_a, v_b, v_c = v_conics.unbind(-1)
         a, b, c = conics
         v_log_compensation = 0.5 * v_compensations * compensations
         v_det = -(v_a * a + v_b * b + v_c * c + v_log_compensation) * inverse_det
         v_sharp = v_det + (v_log_compensation / sharp).where(sharp > 0, 0.0)
-        v_pq = -v_b * inverse_det
-        v_pp, v_qq = v_c * inverse_det + ctx.eps2d * v_det, v_a * inverse_det + ctx.eps2d * v_det
+        scaled = inverse_det / size2d.square()
+        v_pq = -v_b * scaled
+        v_pp, v_qq = v_c * scaled + ctx.eps * v_det, v_a * scaled + ctx.eps * v_det
         turn = 2 * v_sharp * normal
         v_JWRS = torch.stack([2 * v_pp * p + v_pq * q + _cross(q, turn), 2 * v_qq * q + v_pq * p + _cross(turn, p)])
+        v_JWRS = v_JWRS / size2d
 
         axes = R * scales.T
         v_JW = (v_JWRS[:, None] * axes[:, :, None]).sum(2)
@@ -155,8 +167,9 @@ class _Project(torch.autograd.Function):
 def _rotation(quats: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Rotation matrices [3, 3, N], the unit quaternions [4, N], and one over the norms [N], 0 for zero quaternions."""
     quats = quats.T.contiguous()
-    norm = quats.square().sum(0).sqrt()
-    inverse_norm = (1 / norm).where(norm > 0, 0.0)
+    largest = quats.abs().amax(0).clamp_min(LEAST_QUATERNION)
+    norm = (quats / largest).square().sum(0).sqrt() * largest
+    inverse_norm = (1 / norm).where(norm > LEAST_QUATERNION, 0.0)
     unit = quats * inverse_norm
     ww, wx, wy, wz, _, xx, xy, xz, _, _, yy, yz, _, _, _, zz = (2 * unit[:, None] * unit).flatten(0, 1)
     del ww

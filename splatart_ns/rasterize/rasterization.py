@@ -93,9 +93,7 @@ def rasterization(
     ):
         if not is_default:
             raise NotImplementedError(f"rasterization: {name} is not supported")
-    if backend == "auto":
-        backend = "torch" if means.dtype == torch.float64 else default_backend(means.device.type)
-
+    backend = _resolve(backend, means)
     if backend == "gsplat":
         import gsplat
 
@@ -114,20 +112,21 @@ def rasterization(
         )
 
     C, N = len(viewmats), len(means)
-    radii, means2d, depths, conics, compensations = project(
+    project_, composite = _steps(backend)
+    radii, means2d, depths, conics, compensations = project_(
         *(means, quats, scales, viewmats, Ks, width, height, eps2d, near_plane, far_plane, radius_clip)
     )
     opacities = opacities.expand(C, N)
     if rasterize_mode == "antialiased":
         opacities = opacities * compensations
     if sh_degree is not None:
-        colors = sh_colors(means, colors, viewmats, sh_degree)
+        colors = sh_colors(means, colors, viewmats, sh_degree, backend)
 
     with_depth, with_color = render_mode.endswith("D"), render_mode.startswith("RGB")
     channels = [colors.expand(C, -1, -1)] if with_color else []
     if with_depth:
         channels.append(depths[..., None])
-    image, alphas = _compositor(backend)(
+    image, alphas = composite(
         *(means2d, conics, opacities, torch.cat(channels, -1), depths, radii > 0, width, height, absgrad)
     )
     if render_mode.endswith("ED"):
@@ -154,11 +153,15 @@ def rasterization(
     return image, alphas, info
 
 
-def sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int) -> Tensor:
+def sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int, backend: Backend = "auto") -> Tensor:
     """Colours [C, N, 3] seen from the cameras `viewmats` [C, 4, 4] of Gaussians with coefficients `sh`.
 
-    `sh` is [N, K, 3] or [C, N, K, 3], K >= (degree + 1)^2.
+    `sh` is [N, K, 3] or [C, N, K, 3], K >= (degree + 1)^2. `backend` as in `rasterization`.
     """
+    if _resolve(backend, means) == "numba":
+        from splatart_ns.rasterize import numba_spherical_harmonics
+
+        return numba_spherical_harmonics.sh_colors(means, sh, viewmats, degree)
     R, t = viewmats[:, :3, :3], viewmats[:, :3, 3:]
     offsets = (means.T + R.mT @ t).mT  # means - camera centre [C, N, 3], components contiguous
     norm2 = offsets.square().sum(-1, keepdim=True)
@@ -171,11 +174,19 @@ def sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int) -> Tenso
     return ((terms @ channels.repeat(K, 1))[..., :3] + 0.5).clamp_min(0)
 
 
-def _compositor(backend: Backend):
-    if backend == "numba":
-        from splatart_ns.rasterize import numba_backend
+def _resolve(backend: Backend, means: Tensor) -> Backend:
+    """The backend to use for Gaussians at `means`."""
+    if backend == "auto":
+        return "torch" if means.dtype == torch.float64 else default_backend(means.device.type)
+    if backend not in ("torch", "numba", "gsplat"):
+        raise ValueError(f"unknown rasterization backend {backend!r}: use auto, torch, numba or gsplat")
+    return backend
 
-        return numba_backend.rasterize_to_pixels
-    if backend == "torch":
-        return torch_backend.rasterize_to_pixels
-    raise ValueError(f"unknown rasterization backend {backend!r}: use auto, torch, numba or gsplat")
+
+def _steps(backend: Backend):
+    """The functions that project and composite."""
+    if backend == "numba":
+        from splatart_ns.rasterize import numba_backend, numba_projection
+
+        return numba_projection.project, numba_backend.rasterize_to_pixels
+    return project, torch_backend.rasterize_to_pixels

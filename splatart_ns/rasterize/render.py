@@ -54,7 +54,7 @@ def render(
         absgrad, rasterize_mode, backend: See `rasterization`.
     """
     degree = splat.sh_degree if sh_degree is None else min(sh_degree, splat.sh_degree)
-    colors = sh_colors(splat.means, splat.sh, viewmats, degree)
+    colors = sh_colors(splat.means, splat.sh, viewmats, degree, backend)
     if features is not None:
         colors = torch.cat([colors, features.expand(len(viewmats), -1, -1)], -1)
     image, accumulation, info = rasterization(

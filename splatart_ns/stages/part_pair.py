@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -164,6 +164,11 @@ class PartPair:
                 difference = view.render(splat, motion) - view.rgba
                 difference[..., :3] *= RGB_WEIGHT
                 yield difference, view.weight
+
+    def own_cost(self) -> float:
+        """What `cost` would be if each state's Gaussians were looked at in their own state's views."""
+        own = replace(self, splats=self.splats[::-1])
+        return float(own.cost(torch.eye(4).to(self.centroid)[None])[0])
 
     @torch.no_grad()
     def cost(self, T: Tensor) -> Tensor:

@@ -20,8 +20,9 @@ SAMPLES = 500
 """Source points that follow each start."""
 RANDOM_STARTS = 40
 ITERATIONS = 25
-TRIM = 0.15
-"""Share of the worst correspondences that each step leaves out: what only one of the states shows."""
+TRIMS = (0.15, 0.5)
+"""Shares of the worst correspondences that the steps leave out, for what only one of the states shows: a little, or,
+of a drawer that was shut, a lot."""
 COLOUR = 0.3
 """Colour difference (0 to 1) of one counts as this many part radii."""
 
@@ -69,10 +70,11 @@ def part_points(splat: Splat, seen: Tensor, part: int) -> PartPoints:
 
 
 def register(source: PartPoints, target: PartPoints, seed: int = 0, keep: int = 10) -> Registration:
-    """Candidates for the motion of a part, at most `keep`, which differ by 6 degrees or 6 % of the radius or more.
+    """Candidates for the motion of a part, which differ by 6 degrees or 6 % of the radius or more.
 
     Starts: no motion, centroid on centroid with no turn, with the four proper alignments of the principal axes, and
-    with random turns. All starts are followed together. Needs `MIN_POINTS` points on both sides.
+    with random turns. All starts are followed together, once for each of `TRIMS`; of each, at most `keep` are kept. The
+    two starts without a turn are also followed by sliding alone. Needs `MIN_POINTS` points on both sides.
     """
     rng = np.random.default_rng(seed)
     colour = COLOUR * target.radius
@@ -80,13 +82,24 @@ def register(source: PartPoints, target: PartPoints, seed: int = 0, keep: int = 
     target_tree = cKDTree(_features(target, colour))
     sample, back_sample = _sample(source, rng), _sample(target, rng)
 
-    T = _starts(source, target, rng)
-    for _ in range(ITERATIONS):
-        T = _icp_step(T, sample, colour, target, target_tree)
-    forth = _trimmed_distance(T, sample, colour, target_tree)
-    back = _trimmed_distance(np.linalg.inv(T), back_sample, colour, source_tree)
-    fit = (forth + back) / 2
-    chosen = distinct(T, fit, source.centroid, source.radius)[:keep]
+    starts = _starts(source, target, rng)
+    motions, fits = [], []
+    for trim in TRIMS:
+        T, slides = starts, starts[:2]
+        for _ in range(ITERATIONS):
+            T = _icp_step(T, sample, colour, target, target_tree, trim)
+            slides = _icp_step(slides, sample, colour, target, target_tree, trim, turn=False)
+        T = np.concatenate([T, slides])
+        forth = _trimmed_distance(T, sample, colour, target_tree, trim)
+        back = _trimmed_distance(np.linalg.inv(T), back_sample, colour, source_tree, trim)
+        fit = (forth + back) / 2
+        chosen = distinct(T, fit, source.centroid, source.radius)[:keep]
+        # Sliding is so common that it is not to be crowded out.
+        chosen += [i for i in (len(T) - 2, len(T) - 1) if i not in chosen]
+        motions.append(T[chosen])
+        fits.append(fit[chosen])
+    T, fit = np.concatenate(motions), np.concatenate(fits)
+    chosen = distinct(T, fit, source.centroid, source.radius)
     return Registration(T[chosen], fit[chosen])
 
 
@@ -165,24 +178,34 @@ def _moved_features(T: np.ndarray, sample: PartPoints, colour: float) -> np.ndar
     return np.concatenate([xyz, np.broadcast_to(colour * sample.rgb, xyz.shape)], axis=2)
 
 
-def _icp_step(T: np.ndarray, sample: PartPoints, colour: float, target: PartPoints, target_tree: cKDTree) -> np.ndarray:
-    """One step of every motion: nearest points, trimming, the rigid fit (Kabsch 1976)."""
+def _icp_step(
+    T: np.ndarray,
+    sample: PartPoints,
+    colour: float,
+    target: PartPoints,
+    target_tree: cKDTree,
+    trim: float,
+    turn: bool = True,
+) -> np.ndarray:
+    """One step of every motion: nearest points, trimming, the rigid fit (Kabsch 1976); without `turn` its slide."""
     distance, nearest = target_tree.query(_moved_features(T, sample, colour))
-    inlier = distance <= np.quantile(distance, 1 - TRIM, axis=1, keepdims=True)
+    inlier = distance <= np.quantile(distance, 1 - trim, axis=1, keepdims=True)
     w = inlier / inlier.sum(axis=1, keepdims=True)
     goal = target.xyz[nearest]
     source_mean, goal_mean = w @ sample.xyz, (w[..., None] * goal).sum(axis=1)
-    H = (w[..., None] * (sample.xyz - source_mean[:, None])).swapaxes(1, 2) @ (goal - goal_mean[:, None])
-    U, _, Vh = np.linalg.svd(H)
-    flip = np.ones(U.shape[:2])
-    flip[:, 2] = np.linalg.det(U @ Vh)
-    R = (Vh.swapaxes(1, 2) * flip[:, None]) @ U.swapaxes(1, 2)
+    R = T[:, :3, :3]
+    if turn:
+        H = (w[..., None] * (sample.xyz - source_mean[:, None])).swapaxes(1, 2) @ (goal - goal_mean[:, None])
+        U, _, Vh = np.linalg.svd(H)
+        flip = np.ones(U.shape[:2])
+        flip[:, 2] = np.linalg.det(U @ Vh)
+        R = (Vh.swapaxes(1, 2) * flip[:, None]) @ U.swapaxes(1, 2)
     out = np.tile(np.eye(4), (len(T), 1, 1))
     out[:, :3, :3] = R
     out[:, :3, 3] = goal_mean - (R @ source_mean[..., None])[..., 0]
     return out
 
 
-def _trimmed_distance(T: np.ndarray, sample: PartPoints, colour: float, tree: cKDTree) -> np.ndarray:
+def _trimmed_distance(T: np.ndarray, sample: PartPoints, colour: float, tree: cKDTree, trim: float) -> np.ndarray:
     distance = np.sort(tree.query(_moved_features(T, sample, colour))[0], axis=1)
-    return distance[:, : max(1, round((1 - TRIM) * distance.shape[1]))].mean(axis=1)
+    return distance[:, : max(1, round((1 - trim) * distance.shape[1]))].mean(axis=1)

@@ -16,15 +16,11 @@ from splatart_ns.capture.procedural import synthesize_object
 from splatart_ns.capture.synthesis import SynthesisOptions
 from splatart_ns.method_configs.semantic import method as semantic_method
 
-TRAIN_VIEWS, TEST_VIEWS, LABELLED = 10, 3, 5
-
 
 @pytest.fixture(scope="session")
 def capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A hinge in RGBA images of 64 x 64; half of its training frames have labels. Not to be changed."""
-    options = SynthesisOptions(
-        train_views=TRAIN_VIEWS, test_views=TEST_VIEWS, resolution=64, labelled_fraction=LABELLED / TRAIN_VIEWS
-    )
+    options = SynthesisOptions(train_views=10, test_views=3, resolution=64, labelled_fraction=0.5)
     return synthesize_object("hinge", tmp_path_factory.mktemp("captures") / "hinge", options)
 
 
@@ -32,7 +28,7 @@ def capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def opaque_capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same without alpha and silhouettes, in front of grey."""
     path = tmp_path_factory.mktemp("captures") / "opaque"
-    synthesize_object("hinge", path, SynthesisOptions(train_views=TRAIN_VIEWS, test_views=TEST_VIEWS, resolution=32))
+    synthesize_object("hinge", path, SynthesisOptions(train_views=10, test_views=3, resolution=32))
     for state in path.glob("state_*"):
         meta = json.loads((state / "transforms.json").read_text())
         for frame in meta["frames"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -77,22 +78,23 @@ def test_the_runs_find_each_other_and_end_in_a_bundle(commands: Commands, joint_
     assert abs(float(joint.values[1])) == pytest.approx(abs(values[1] - values[0]), abs=0.15)
 
 
-@pytest.mark.parametrize("method", ["semantic", "joint"])
-def test_ns_eval_measures(commands: Commands, method: str, semantic_run: Path, joint_run: Path) -> None:
-    run = {"semantic": semantic_run, "joint": joint_run}[method]
-    commands.fork("ns-eval", "--load-config", run, "--output-path", f"{method}.json")
+METHODS = ["splatart-semantic", "splatart-pose", "splatart-joint"]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_ns_eval_measures(commands: Commands, method: str, joint_run: Path) -> None:
+    commands.fork("ns-eval", "--load-config", only_run(commands, method), "--output-path", f"{method}.json")
     results = json.loads((commands.folder / f"{method}.json").read_text())["results"]
     assert 17 < results["psnr"] < 60
     assert 0.6 < results["ssim"] < 1
 
 
-@pytest.mark.parametrize("method", ["semantic", "joint"])
-def test_ns_render_writes_every_output(commands: Commands, method: str, semantic_run: Path, joint_run: Path) -> None:
-    run = {"semantic": semantic_run, "joint": joint_run}[method]
+@pytest.mark.parametrize("method", METHODS)
+def test_ns_render_writes_every_output(commands: Commands, method: str, joint_run: Path) -> None:
     names = ["rgb", "depth", "accumulation", "parts", "part_confidence", "rgba"]
-    output = commands.folder / f"renders_{method}"
-    where = ("--load-config", run, "--output-path", output, "--image-format", "png", "--split", "test")
-    commands.fork("ns-render", "dataset", *where, "--rendered-output-names", *names)
+    output = commands.folder / f"renders-{method}"
+    where = ("--load-config", only_run(commands, method), "--output-path", output, "--image-format", "png")
+    commands.fork("ns-render", "dataset", *where, "--split", "test", "--rendered-output-names", *names)
     images = {name: [cv2.imread(str(p), -1) for p in sorted((output / "test" / name).glob("*.png"))] for name in names}
     for name in names:
         assert [image.shape for image in images[name]] == 3 * [(64, 64, 4 if name == "rgba" else 3)]
@@ -114,24 +116,47 @@ def test_ns_export_writes_a_splat(commands: Commands, joint_run: Path) -> None:
     assert (commands.folder / "export" / "splat.ply").read_bytes().startswith(b"ply")
 
 
-@pytest.mark.parametrize("command", ["ns-viewer", "ns-train"])
-def test_a_slider_moves_its_part_in_the_viewer(commands: Commands, command: str, joint_run: Path) -> None:
+@contextmanager
+def watched(commands: Commands, *argv: object) -> Iterator[ViewerClient]:
+    """A client of the viewer of a command that is ended afterwards."""
     port = free_port()
-    what = ("--load-config", joint_run) if command == "ns-viewer" else ("splatart-joint", "--data", "hinge")
-    viewer = commands.start(command, *what, "--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port)
+    viewer = commands.start(*argv, "--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port)
     try:
         client = ViewerClient(port, viewer.is_alive)
+        yield client
+        client.close()
+    finally:
+        viewer.terminate()
+        viewer.join()
+    assert "Traceback" not in commands.printed(viewer)
+
+
+WATCHED = ("--data", "hinge", "--output-dir", "watched")
+
+
+def test_the_semantic_stage_can_be_watched(commands: Commands) -> None:
+    steps = ("--max-num-iterations", 30, "--pipeline.model.semantic-start", 20)
+    with watched(commands, "ns-train", "splatart-semantic", *WATCHED, *steps) as client:
+        assert client.settled_image().std() > 5
+
+
+def test_the_pose_stage_can_be_watched(commands: Commands, semantic_run: Path) -> None:
+    steps = ("--max-num-iterations", 20, "--pipeline.model.pose-steps", 10)
+    with watched(commands, "ns-train", "splatart-pose", *WATCHED, *steps) as client:
+        assert client.settled_image().std() > 5
+
+
+@pytest.mark.parametrize("command", ["ns-viewer", "ns-train"])
+def test_a_slider_moves_its_part_in_the_viewer(commands: Commands, command: str, joint_run: Path) -> None:
+    what = ("--load-config", joint_run) if command == "ns-viewer" else ("splatart-joint", *WATCHED)
+    with watched(commands, command, *what) as client:
         slider = client.slider("base_to_lid (degree)")
         assert slider["min"] < slider["value"] < slider["max"]
         before = client.settled_image()
         client.move(slider, slider["max"])
         after = client.settled_image()
-        client.close()
-    finally:
-        viewer.terminate()
-        viewer.join()
     assert before.std() > 5, "the object is not in view"
-    assert (np.abs(before.astype(int) - after).max(-1) > 30).mean() > 0.005, commands.printed(viewer)[-2000:]
+    assert (np.abs(before.astype(int) - after).max(-1) > 30).mean() > 0.005
 
 
 def test_a_users_mistake_is_told_in_one_sentence(commands: Commands, capture_dir: Path, tmp_path: Path) -> None:

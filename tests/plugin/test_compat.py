@@ -1,7 +1,9 @@
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -89,24 +91,9 @@ def test_other_exceptions_keep_their_traceback(capsys: pytest.CaptureFixture[str
 
 
 def test_the_viewer_opens_on_the_whole_object() -> None:
-    class Camera:
-        position = look_at = None
-
-    class Client:
-        camera = Camera()
-
-        def atomic(self):
-            import contextlib
-
-            return contextlib.nullcontext()
-
-    class Viewer:
-        class viser_server:
-            @staticmethod
-            def on_client_connect(callback):
-                callback(Client())
-
-    StartView(np.array([0.0, 0.0, 7.0]))._setup(Viewer())
-    # 75 degrees from top to bottom, in viser's unit of a tenth
-    assert np.linalg.norm(Camera.position) / 10 > 1 / np.sin(np.radians(37.5))
-    assert np.allclose(Client.camera.position, [0, 0, 22]) and np.allclose(Client.camera.look_at, 0)
+    client = SimpleNamespace(atomic=nullcontext, camera=SimpleNamespace())
+    server = SimpleNamespace(on_client_connect=lambda callback: callback(client))
+    StartView(np.array([0.0, 0.0, 7.0]))._setup(SimpleNamespace(viser_server=server))
+    # Viser's unit is a tenth of ours, and its camera sees 75 degrees.
+    assert client.camera.position[2] / 10 > 1 / np.sin(np.radians(75 / 2))
+    assert np.allclose(client.camera.position[:2], 0) and np.allclose(client.camera.look_at, 0)

@@ -1,0 +1,239 @@
+import copy
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.viewer.utils import parse_object
+from nerfstudio.viewer.viewer_elements import ViewerSlider
+from torch import Tensor
+
+from splatart_ns.capture.capture import Normalization
+from splatart_ns.errors import InputError
+from splatart_ns.geometry.se3 import adjoint, se3_exp, se3_log
+from splatart_ns.method_configs.joint import method as joint_method
+from splatart_ns.plugin.joint import (
+    JointModel,
+    JointModelConfig,
+    JointPipeline,
+    covariances_to_world,
+    slider_range,
+    splat_to_world,
+    surface_points,
+)
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.articulate import Joint, KinematicTree
+from splatart_ns.stages.joint import JointFit
+
+NORMALIZATION = Normalization(np.array([0.5, -1.0, 2.0]), 4.0)
+DOOR, DRAWER = 0.6, 0.25
+"""Radian and metre from state 0 to state 1."""
+HINGE = torch.tensor([0.4, -0.9, 2.1], dtype=torch.float64)
+"""A point on the door's axis in the capture's world."""
+
+
+def splat_of_parts(*parts: int, spread: float = 0.3) -> Splat:
+    generator = torch.Generator().manual_seed(0)
+    count = 20 * len(parts)
+    ids = torch.tensor(parts).repeat_interleave(20)
+    return Splat(
+        means=spread * torch.randn(count, 3, generator=generator),
+        quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=-1),
+        log_scales=torch.full((count, 3), -3.0),
+        opacity_logits=torch.linspace(-3, 3, count),
+        sh=torch.randn(count, 4, 3, generator=generator),
+        part_logits=5 * torch.nn.functional.one_hot(ids, 4).float(),
+    )
+
+
+def translation(x: float, y: float, z: float) -> Tensor:
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, 3] = torch.tensor([x, y, z])
+    return T
+
+
+def new_model(state: int = 0) -> JointModel:
+    metadata = {
+        "part_names": ["background", "body", "door", "drawer"],
+        "state": state,
+        "length_unit": "metre",
+        "normalization": NORMALIZATION,
+        "frames": [type("Frame", (), {"T_world_camera": translation(0, 0, 5).numpy()})],
+    }
+    config = JointModelConfig(num_random=10, sh_degree=1)
+    return config.setup(scene_box=None, num_train_data=1, metadata=metadata, device="cpu", grad_scaler=None).eval()
+
+
+def started_model(state: int = 0) -> tuple[JointModel, Splat, Tensor]:
+    """A model of a body with a door that turns and a drawer that slides; the splat, and the motions in the world."""
+    door_at = translation(*HINGE) @ se3_exp(torch.tensor([0, 0, 0, 0, 0, DOOR]).double()) @ translation(*-HINGE)
+    motions = torch.eye(4, dtype=torch.float64).repeat(2, 3, 1, 1)
+    motions[1, 1], motions[1, 2] = door_at, translation(DRAWER, 0, 0)
+    z, x, zero = torch.tensor([0.0, 0, 1]).double(), torch.tensor([1.0, 0, 0]).double(), torch.zeros(3).double()
+    door = JointFit("revolute", z, HINGE, 0.0, torch.tensor([0.0, DOOR]).double(), residual=0.0)
+    drawer = JointFit("prismatic", x, zero, 0.0, torch.tensor([0.0, DRAWER]).double(), residual=0.0)
+    tree = KinematicTree([1, 2, 3], 1, [Joint(1, 2, door), Joint(1, 3, drawer)])
+    splat = splat_of_parts(1, 2, 3)
+    model = new_model(state)
+    model.start(splat, tree, motions, NORMALIZATION)
+    return model, splat, motions
+
+
+def world(x: Tensor) -> Tensor:
+    """Points of the normalised world in the capture's."""
+    return x.double() / NORMALIZATION.scale + torch.from_numpy(NORMALIZATION.centre)
+
+
+def test_one_slider_a_joint_with_its_unit() -> None:
+    model, _, _ = started_model(state=1)
+    door, drawer = (slider for _, slider in sorted(parse_object(model, ViewerSlider, ""), key=lambda found: found[0]))
+    assert door.name == "body_to_door (degree)" and drawer.name == "body_to_drawer (metre)"
+    assert door.value == pytest.approx(math.degrees(DOOR)) and drawer.value == pytest.approx(DRAWER)
+    assert door.min < -0.4 * math.degrees(DOOR) and door.max > 1.4 * math.degrees(DOOR)
+
+
+@pytest.mark.parametrize("state", [0, 1])
+def test_at_first_the_state_is_shown(state: int) -> None:
+    model, splat, motions = started_model(state)
+    posed = world(model.posed_splat().means)
+    for part in (1, 2, 3):
+        own = splat.part_ids == part
+        T = motions[state, part - 1]
+        assert torch.allclose(posed[own], world(splat.means[own]) @ T[:3, :3].T + T[:3, 3], atol=1e-5)
+
+
+def test_a_slider_moves_its_part_and_no_other() -> None:
+    model, splat, _ = started_model()
+    model.joint_00.default_value = math.degrees(2 * DOOR)
+    posed, before, part = world(model.posed_splat().means), world(splat.means), splat.part_ids
+    assert torch.allclose(posed[part != 2], before[part != 2], atol=1e-5)
+    turned, arm = posed[part == 2] - HINGE, before[part == 2] - HINGE
+    c, s = math.cos(2 * DOOR), math.sin(2 * DOOR)
+    assert torch.allclose(turned[:, :2], arm[:, :2] @ torch.tensor([[c, s], [-s, c]]).double(), atol=1e-5)
+
+    model.joint_00.default_value, model.joint_01.default_value = 0.0, -0.1
+    moved = world(model.posed_splat().means) - before
+    assert torch.allclose(moved[part == 3], torch.tensor([-0.1, 0, 0]).double(), atol=1e-5)
+
+
+def test_a_checkpoint_brings_joints_and_sliders_back() -> None:
+    model, _, _ = started_model(state=1)
+    loaded = new_model(state=1)
+    loaded.load_state_dict(model.state_dict())
+    assert loaded.joint_01.name == "body_to_drawer (metre)"
+    assert torch.equal(loaded.posed_splat().means, model.posed_splat().means)
+    assert loaded.tree.root == 1 and [j.fit.type for j in loaded.tree.joints] == ["revolute", "prismatic"]
+
+
+def test_an_object_without_joints_has_no_sliders() -> None:
+    model, splat = new_model(), splat_of_parts(1, 2, 3)
+    model.start(splat, KinematicTree([1, 2, 3], 1, []), torch.eye(4).double().repeat(2, 3, 1, 1), NORMALIZATION)
+    assert parse_object(model, ViewerSlider, "") == []
+    assert torch.allclose(model.posed_splat().means, splat.means, atol=1e-6)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 34.4), (-0.25, 0.0), (0.0, 1e-12), (-1500.0, 2500.0), (10.0, 11.0)])
+def test_a_sliders_range_holds_what_was_observed_in_round_steps(low: float, high: float) -> None:
+    start, end, step = slider_range(low, high)
+    assert start <= low - 0.5 * (high - low) and end >= high + 0.5 * (high - low)
+    assert 100 <= (end - start) / step <= 1002
+    assert math.log10(step) == pytest.approx(round(math.log10(step)))
+
+
+def test_a_splat_in_the_world_has_its_size_and_place() -> None:
+    splat = splat_of_parts(1)
+    out = splat_to_world(splat, NORMALIZATION)
+    assert torch.allclose(out.means.double(), world(splat.means), atol=1e-6)
+    assert torch.allclose(out.log_scales.exp() * NORMALIZATION.scale, splat.log_scales.exp())
+
+
+def test_covariances_follow_the_change_of_world() -> None:
+    generator = torch.Generator().manual_seed(1)
+    T = se3_exp(0.5 * torch.randn(6, generator=generator).double())
+    steps = 1e-5 * torch.randn(400, 6, generator=generator).double()
+
+    def to_world(motion: Tensor) -> Tensor:
+        return torch.from_numpy(NORMALIZATION.motion_to_world(motion.numpy()))
+
+    in_world = se3_log(to_world(se3_exp(steps) @ T) @ torch.linalg.inv(to_world(T)))
+    expected = in_world.T @ in_world
+    assert torch.allclose(covariances_to_world(steps.T @ steps, NORMALIZATION), expected, rtol=1e-3, atol=1e-14)
+
+
+def test_faint_parts_keep_points() -> None:
+    splat = splat_of_parts(1)
+    assert len(surface_points(splat)) > 10
+    splat.opacity_logits = torch.full((20,), -4.0)
+    assert len(surface_points(splat)) == 20
+
+
+def pose_state(merged: bool = True) -> dict[str, Tensor]:
+    """What a pose run on two states and two parts leaves."""
+    splat = splat_of_parts(1, 2)
+    base = torch.eye(4, dtype=torch.float64).repeat(2, 2, 1, 1)
+    base[1, 1] = se3_exp(torch.tensor([0, 0, 0, 0, 0, DOOR]).double())
+    state = {
+        "means": splat.means,
+        "scales": splat.log_scales,
+        "quats": splat.quats,
+        "opacities": splat.opacity_logits[:, None],
+        "features_dc": splat.sh[:, 0],
+        "features_rest": splat.sh[:, 1:],
+        "semantics": splat.part_logits[:, :3],
+    }
+    covariance = 1e-8 * torch.eye(6, dtype=torch.float64).repeat(2, 2, 1, 1)
+    return {f"_model.gauss_params.{name}": value for name, value in state.items()} | {
+        "_model.poses.base": base,
+        "_model.covariance": covariance,
+        "_model.held_ratio": torch.full((2, 2), torch.nan),
+        "_model.merged": torch.tensor(merged),
+    }
+
+
+def joint_pipeline(folder: Path, capture: Path, state: dict[str, Tensor], **settings) -> JointPipeline:
+    (folder / "nerfstudio_models").mkdir()
+    torch.save({"pipeline": state}, folder / "nerfstudio_models" / "step-000000001.ckpt")
+    config = copy.deepcopy(joint_method.config.pipeline)
+    config.datamanager.data, config.pose_run = capture, folder / "config.yml"
+    for name, value in settings.items():
+        setattr(config, name, value)
+    return config.setup(device="cpu", test_mode="val")
+
+
+def test_poses_become_a_joint_a_bundle_and_a_slider(tmp_path: Path, capture_dir: Path) -> None:
+    pipeline = joint_pipeline(tmp_path, capture_dir, pose_state(), root="lid")
+    (joint,) = pipeline.bundle.joints
+    assert (joint.type, joint.parent, joint.child) == ("revolute", "lid", "base")
+    assert float(joint.values[1].abs()) == pytest.approx(DOOR, abs=1e-3)
+    assert torch.allclose(joint.axis.abs(), torch.tensor([0.0, 0, 1]).double(), atol=1e-3)
+    (slider,) = (slider for _, slider in parse_object(pipeline, ViewerSlider, ""))
+    assert slider.name == "lid_to_base (degree)"
+    # The bundle is in the capture's unit.
+    normal = splat_of_parts(1, 2)
+    centre = normal.means[normal.part_ids == 1].double().mean(0) / pipeline.datamanager.capture.normalization.scale
+    expected = centre + torch.from_numpy(pipeline.datamanager.capture.normalization.centre)
+    assert torch.allclose(pipeline.bundle.parts[0].splat.means.double().mean(0), expected, atol=1e-5)
+
+
+def test_an_unfinished_or_foreign_pose_run_is_refused(tmp_path: Path, capture_dir: Path) -> None:
+    foreign = pose_state() | {"_model.poses.base": torch.eye(4).double().repeat(2, 3, 1, 1)}
+    stage_1 = {name: value for name, value in pose_state().items() if "gauss_params" in name}
+    for number, state in enumerate((pose_state(merged=False), foreign, stage_1)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        with pytest.raises(InputError, match="no finished splatart-pose run"):
+            joint_pipeline(folder, capture_dir, state)
+
+
+def test_a_root_that_is_no_part_is_told(tmp_path: Path, capture_dir: Path) -> None:
+    with pytest.raises(InputError, match="no part 'door'"):
+        joint_pipeline(tmp_path, capture_dir, pose_state(), root="door")
+
+
+def test_the_adjoint_of_the_world_is_the_covariances_map() -> None:
+    # A rigid change of world (scale 1) is the adjoint of a translation.
+    rigid = Normalization(NORMALIZATION.centre, 1.0)
+    A = adjoint(translation(*rigid.centre))
+    C = torch.diag(torch.arange(1.0, 7.0)).double()
+    assert torch.allclose(covariances_to_world(C, rigid), A @ C @ A.T)
