@@ -128,6 +128,18 @@ def test_a_damaged_bundle_is_written_again(fit_copy, hinge_fit, hinge_capture, r
     assert results(fit_copy) == results(hinge_fit)
 
 
+def test_another_root_takes_the_last_stage_only(fit_copy, hinge_capture, run_main):
+    before = contents(fit_copy)
+    assert run_main("fit", hinge_capture, "--output-dir", fit_copy, "--quality", "draft", "--root", "lid")[0] == 0
+    after = contents(fit_copy)
+    runs = [fit_copy / "runs" / run for run in RUNS[:3]]
+    assert all(after[f] == before[f] for f in before if any((fit_copy / f).is_relative_to(run) for run in runs))
+    bundle = load_bundle(fit_copy)
+    assert bundle.root == "lid"
+    assert [(joint.parent, joint.child) for joint in bundle.joints] == [("lid", "base")]
+    assert finished_stages(fit_copy) == STAGES
+
+
 class TestResuming:
     """What of an earlier run counts."""
 
@@ -145,7 +157,7 @@ class TestResuming:
         again = report(fit_copy, hinge_capture)
         assert all(again.resume(stage, whole=True) for stage in STAGES)
 
-    @pytest.mark.parametrize("other", [{"seed": 1}, {"quality": "high"}, {"root": "lid"}])
+    @pytest.mark.parametrize("other", [{"seed": 1}, {"quality": "high"}])
     def test_none_with_other_settings(self, report, fit_copy, hinge_capture, other):
         assert not report(fit_copy, hinge_capture, **other).resume(STAGES[0], whole=True)
         assert finished_stages(fit_copy) == []

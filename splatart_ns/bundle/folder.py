@@ -21,7 +21,10 @@ ARTICULATION = "articulation.json"
 
 
 def save_bundle(bundle: Bundle, folder: Path) -> None:
-    """Write the parts' PLYs and then `articulation.json`, each to a temporary name first."""
+    """Write the parts' PLYs and then `articulation.json`, each to a temporary name first.
+
+    PLYs of parts that an earlier bundle in the folder had are removed.
+    """
     folder = Path(folder)
     splats = _splat_paths(bundle)
     for part in bundle.parts:
@@ -67,6 +70,8 @@ def save_bundle(bundle: Bundle, folder: Path) -> None:
             "provenance": bundle.provenance,
         },
     )
+    for stale in set((folder / "parts").glob("*.ply")) - {folder / path for path in splats.values()}:
+        stale.unlink()
 
 
 def _splat_paths(bundle: Bundle) -> dict[str, str]:

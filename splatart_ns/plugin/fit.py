@@ -94,7 +94,11 @@ class Report:
             stages = [
                 {**entry, "name": str(entry["name"]), "seconds": entry["seconds"] + 0.0} for entry in earlier["stages"]
             ]
-            same = all(earlier.get(key) == self.data[key] for key in ("capture", "capture_sha256", "settings"))
+            had, wanted = earlier["settings"], self.data["settings"]
+            same = all(earlier.get(key) == self.data[key] for key in ("capture", "capture_sha256"))
+            same = same and {**had, "root": None} == {**wanted, "root": None}
+            if had["root"] != wanted["root"]:  # the last stage alone asks for it
+                stages = [stage for stage in stages if stage["name"] != "joint"]
         except (OSError, ValueError, LookupError, TypeError, AttributeError):
             raise InputError(
                 f"{self.path} is not a report of `splatart fit`; remove it or choose another --output-dir."

@@ -141,6 +141,8 @@ class PosePipeline(VanillaPipeline):
                 f"{run} was trained with {splat.part_logits.shape[1] - 1} parts and the capture has "
                 f"{self.model.num_parts}; train splatart-semantic again."
             )
+        if not bool((splat.part_ids > 0).any()):
+            raise InputError(f"{run} learned no parts; train splatart-semantic longer, with labelled frames.")
         return splat.select(splat.part_ids > 0)
 
     def _initial_poses(self, splats: list[Splat]) -> tuple[Tensor, Tensor]:
@@ -234,6 +236,12 @@ class PosePipeline(VanillaPipeline):
 
     def get_training_callbacks(self, training_callback_attributes) -> list[TrainingCallback]:
         optimizers = training_callback_attributes.optimizers.optimizers
+        steps = training_callback_attributes.trainer.config.max_num_iterations
+        if steps <= self.model.config.pose_steps:
+            raise InputError(
+                f"--max-num-iterations is {steps}, but the parts are merged at step {self.model.config.pose_steps}; "
+                "give more iterations or a smaller --pipeline.model.pose-steps."
+            )
 
         def merge(step: int) -> None:
             if step == self.model.config.pose_steps:

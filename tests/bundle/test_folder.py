@@ -209,3 +209,10 @@ def test_a_link_out_of_the_folder_is_refused(folder, tmp_path_factory):
 def test_a_folder_without_a_bundle_is_named(tmp_path):
     with pytest.raises(InputError, match="articulation.json"):
         load_bundle(tmp_path)
+
+
+def test_saving_over_another_bundle_leaves_only_its_own_parts(bundle, tmp_path):
+    save_bundle(bundle, tmp_path)
+    (tmp_path / "parts" / "of_an_earlier_bundle.ply").write_bytes(b"ply")
+    save_bundle(bundle, tmp_path)
+    assert len(list((tmp_path / "parts").glob("*.ply"))) == len(bundle.parts)
