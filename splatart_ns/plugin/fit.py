@@ -182,6 +182,8 @@ def _semantic_config(capture: Capture, state: int, effort: Effort, seed: int) ->
     part_steps = config.max_num_iterations - config.pipeline.model.semantic_start
     config.max_num_iterations = effort.steps + part_steps
     config.pipeline.model.semantic_start = effort.steps
+    config.pipeline.model.stop_split_at = 7 * effort.steps // 10
+    config.pipeline.model.max_gaussians = 3 * effort.gaussians // 2
     for optimizer in config.optimizers.values():
         if optimizer["scheduler"] is not None:
             optimizer["scheduler"].max_steps = effort.steps

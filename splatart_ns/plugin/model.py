@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -35,7 +36,7 @@ class SplatartModelConfig(SplatfactoModelConfig):
     """Number of random Gaussians to start from, when neither points nor silhouettes say where the object is."""
     random_scale: float = 2.0
     """Side of the cube of random Gaussians; 2 is what the cameras see at the distance of their focus."""
-    background_color: str = "white"
+    background_color: Literal["random", "black", "white"] = "white"
     """Background of rendered images: random (in training), black or white."""
     sh_degree: int = 1
     """Degree of the spherical harmonics; higher ones pay where surfaces shine."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -32,7 +33,7 @@ class SemanticModelConfig(SplatartModelConfig):
     """Whether the logits start from the labels' votes, counted in one backward pass a labelled view."""
     max_gaussians: int = 12000
     """Gaussians are not split or duplicated beyond this number."""
-    background_color: str = "random"
+    background_color: Literal["random", "black", "white"] = "random"
 
 
 class SemanticModel(SplatartModel):
