@@ -1,4 +1,4 @@
-"""Projection of Gaussians and its gradient in one pass each, compiled by numba; the formulas are `projection.project`'s.
+"""Projection of Gaussians and its gradient, one pass each, compiled by numba; the formulas of `projection.project`.
 
 Inside, everything is float64: that costs nothing here, and no scale, distance or needle that float32 can express
 overflows or cancels. The gradients of the cameras are summed block by block, in an order that threads do not change.

@@ -44,7 +44,9 @@ class _Colors(torch.autograd.Function):
         v_offsets = np.empty((len(centers) if need_means or need_centers else 0, *means.shape), np.float32)
         v_sh = np.empty(sh.shape if need_sh else (0, 0, 0, 0), np.float32)
         bounds = even_bounds(len(means), num_workers())
-        run(_colors_backward, bounds, means, sh, centers, degree, colors, v_colors.contiguous().numpy(), v_offsets, v_sh)
+        run(
+            _colors_backward, bounds, means, sh, centers, degree, colors, v_colors.contiguous().numpy(), v_offsets, v_sh
+        )
         v_offsets = torch.from_numpy(v_offsets)
         return (
             v_offsets.sum(0) if need_means else None,
@@ -134,7 +136,7 @@ def _colors(begin, end, worker, means, sh, centers, degree, colors):
 
 @jit
 def _colors_backward(begin, end, worker, means, sh, centers, degree, colors, v_colors, v_offsets, v_sh):
-    """Fills v_offsets [C, N, 3], the gradients by the Gaussians' positions before each camera, and v_sh, unless empty."""
+    """Fills v_offsets [C, N, 3], the gradients by the positions before each camera, and v_sh, unless empty."""
     K = (degree + 1) ** 2
     basis, v_basis = np.empty(16, np.float32), np.empty(16, np.float32)
     if v_sh.shape[1] > 0:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-from typing import Any, Literal
+import math
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
+from splatart_ns.errors import InputError
 from splatart_ns.geometry.spherical_harmonics import sh_basis
 from splatart_ns.rasterize import torch_backend
 from splatart_ns.rasterize.projection import project
@@ -17,14 +19,39 @@ Backend = Literal["auto", "torch", "numba", "gsplat"]
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 
 
-@functools.cache
+_chosen: Backend = "auto"
+
+
+def set_backend(backend: Backend) -> None:
+    """Choose what "auto" stands for in this process; "auto" is this machine's best again.
+
+    Raises:
+        InputError: The backend cannot run here.
+    """
+    global _chosen
+    if backend not in get_args(Backend):
+        raise InputError(f"There is no rasterizer {backend!r}: take one of {', '.join(get_args(Backend))}.")
+    if backend == "numba" and not _has_numba():
+        raise InputError("The numba rasterizer needs numba: pip install 'splatart-ns[cpu]', or take the torch one.")
+    if backend == "gsplat" and not torch.cuda.is_available():
+        raise InputError("The gsplat rasterizer needs CUDA, which torch does not find: take auto, numba or torch.")
+    _chosen = backend
+
+
 def default_backend(device_type: str | None = None) -> Backend:
     """The backend that "auto" stands for on a type of device ("cpu", "cuda", ...), by default this machine's best."""
+    if _chosen != "auto":
+        return _chosen
     if device_type is None:
         device_type = "cuda" if torch.cuda.is_available() else "cpu"
     if device_type == "cuda":
         return "gsplat"
-    return "numba" if device_type == "cpu" and importlib.util.find_spec("numba") is not None else "torch"
+    return "numba" if device_type == "cpu" and _has_numba() else "torch"
+
+
+@functools.cache
+def _has_numba() -> bool:
+    return importlib.util.find_spec("numba") is not None
 
 
 def rasterization(
@@ -75,8 +102,8 @@ def rasterization(
         rasterize_mode: "antialiased" keeps the mass of Gaussians that `eps2d` blurs (Mip-Splatting).
         packed, tile_size, sparse_grad, channel_chunk: Ignored; results are never packed.
         distributed, camera_model, covars: Only gsplat's defaults are supported.
-        backend: "gsplat" (CUDA), "numba" (CPU, float32), "torch" (any device), or "auto": the first of these for the
-            device of `means`, and torch for float64.
+        backend: "gsplat" (CUDA), "numba" (CPU, float32), "torch" (any device), or "auto": what `set_backend` chose or
+            the first of these for the device of `means`; torch for anything but float32.
 
     Returns:
         The image [C, H, W, D], [C, H, W, 1] or [C, H, W, D + 1]; its alpha [C, H, W, 1]; and `info`, the intermediate
@@ -85,6 +112,7 @@ def rasterization(
 
     Raises:
         NotImplementedError: For a camera model but pinhole, distributed rendering or given covariances.
+        ValueError: A tensor holds NaN or infinity, or the backend is unknown or not for these tensors.
     """
     for name, is_default in (
         (f"camera_model={camera_model!r}", camera_model == "pinhole"),
@@ -94,6 +122,8 @@ def rasterization(
         if not is_default:
             raise NotImplementedError(f"rasterization: {name} is not supported")
     backend = _resolve(backend, means)
+    tensors = dict(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
+    _require_finite(**tensors, viewmats=viewmats, Ks=Ks, backgrounds=backgrounds)
     if backend == "gsplat":
         import gsplat
 
@@ -120,7 +150,7 @@ def rasterization(
     if rasterize_mode == "antialiased":
         opacities = opacities * compensations
     if sh_degree is not None:
-        colors = sh_colors(means, colors, viewmats, sh_degree, backend)
+        colors = _sh_colors(means, colors, viewmats, sh_degree, backend)
 
     with_depth, with_color = render_mode.endswith("D"), render_mode.startswith("RGB")
     channels = [colors.expand(C, -1, -1)] if with_color else []
@@ -158,7 +188,12 @@ def sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int, backend:
 
     `sh` is [N, K, 3] or [C, N, K, 3], K >= (degree + 1)^2. `backend` as in `rasterization`.
     """
-    if _resolve(backend, means) == "numba":
+    _require_finite(means=means, sh=sh, viewmats=viewmats)
+    return _sh_colors(means, sh, viewmats, degree, _resolve(backend, means))
+
+
+def _sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int, backend: Backend) -> Tensor:
+    if backend == "numba":
         from splatart_ns.rasterize import numba_spherical_harmonics
 
         return numba_spherical_harmonics.sh_colors(means, sh, viewmats, degree)
@@ -177,10 +212,26 @@ def sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int, backend:
 def _resolve(backend: Backend, means: Tensor) -> Backend:
     """The backend to use for Gaussians at `means`."""
     if backend == "auto":
-        return "torch" if means.dtype == torch.float64 else default_backend(means.device.type)
-    if backend not in ("torch", "numba", "gsplat"):
-        raise ValueError(f"unknown rasterization backend {backend!r}: use auto, torch, numba or gsplat")
+        return default_backend(means.device.type) if means.dtype == torch.float32 else "torch"
+    if backend not in get_args(Backend):
+        raise ValueError(f"unknown rasterization backend {backend!r}: use {', '.join(get_args(Backend))}")
+    if backend == "numba" and (means.dtype, means.device.type) != (torch.float32, "cpu"):
+        raise ValueError(f"the numba backend takes float32 on the CPU, not {means.dtype} on {means.device}: use torch")
     return backend
+
+
+def _require_finite(**tensors: Tensor | None) -> None:
+    tensors = {name: tensor.detach() for name, tensor in tensors.items() if tensor is not None}
+    # A sum is the fastest look at every value, and is not finite unless all are; one transfer fetches all sums.
+    sums = torch.stack([tensor.sum() for tensor in tensors.values()]).tolist()
+    for (name, tensor), total in zip(tensors.items(), sums, strict=True):
+        if not math.isfinite(total):
+            bad = (~tensor.isfinite()).nonzero()
+            if len(bad):
+                where = ", ".join(map(str, bad[0].tolist()))
+                raise ValueError(
+                    f"rasterization: {name}[{where}] is {tensor[tuple(bad[0])]}, one of {len(bad)} not finite"
+                )
 
 
 def _steps(backend: Backend):

@@ -116,11 +116,12 @@ class _Pairs:
         ids = (visible & (opacities >= MIN_ALPHA)).nonzero()[:, 0]
         ids = ids.index_select(0, _stable_argsort(depths.index_select(0, ids)))
 
-        # q(x, y) = a (x + slope y)^2 + rest y^2, in float64 because rest cancels for needles. Alpha >= 1/255 where
-        # q <= reach; the slack makes culling err on the safe side.
-        a, b, c = conics.index_select(0, ids).double().unbind(-1)
-        mx, my = means2d.index_select(0, ids).double().unbind(-1)
-        opacity = opacities.index_select(0, ids).double()
+        # q(x, y) = a (x + slope y)^2 + rest y^2, in float64 (which MPS lacks) because rest cancels for needles.
+        # Alpha >= 1/255 where q <= reach; the slack makes culling err on the safe side.
+        wide = means2d.dtype if means2d.device.type == "mps" else torch.float64
+        a, b, c = conics.index_select(0, ids).to(wide).unbind(-1)
+        mx, my = means2d.index_select(0, ids).to(wide).unbind(-1)
+        opacity = opacities.index_select(0, ids).to(wide)
         slope = b / a
         rest = (c - b * slope).clamp_min(1e-12)
         reach = (1 + 1e-4) * 2 * (255 * opacity).log() + 1e-4

@@ -5,7 +5,8 @@ import torch
 
 def project(means, quats, scales, viewmats, Ks, margins):
     """Means, covariances before the blur, and depths by matrices; `margins` limit x/z and y/z in the slope."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    largest = quats.detach().abs().amax(-1, keepdim=True)
+    w, x, y, z = torch.nn.functional.normalize(quats / largest.where(largest > 0, 1.0), dim=-1).unbind(-1)
     R = torch.stack(
         [
             *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -33,24 +34,41 @@ def project(means, quats, scales, viewmats, Ks, margins):
 
 
 def composite(means2d, conics, opacities, colors, depths, visible, width, height):
-    """Front to back over black, one camera after another, one Gaussian after another, all pixels at once."""
+    """Front to back over black, one camera after another, all Gaussians at every pixel."""
     ys, xs = torch.meshgrid(*(torch.arange(n).to(means2d) + 0.5 for n in (height, width)), indexing="ij")
     images, alphas = [], []
     for c in range(len(means2d)):
-        T = torch.ones(height, width, dtype=means2d.dtype)
-        alive = torch.ones(height, width, dtype=torch.bool)
-        image = torch.zeros(height, width, colors.shape[-1], dtype=means2d.dtype)
-        for i in depths[c].argsort(stable=True).tolist():
-            if not visible[c, i]:
-                continue
-            dx, dy = xs - means2d[c, i, 0], ys - means2d[c, i, 1]
-            q = conics[c, i, 0] * dx * dx + 2 * conics[c, i, 1] * dx * dy + conics[c, i, 2] * dy * dy
-            alpha = (opacities[c, i] * torch.exp(-0.5 * q)).clamp_max(0.999)
-            alpha = torch.where(alpha >= 1 / 255, alpha, torch.zeros_like(alpha))
-            alive = alive & (T * (1 - alpha) > 1e-4)
-            alpha = torch.where(alive, alpha, torch.zeros_like(alpha))
-            image = image + (T * alpha)[..., None] * colors[c, i]
-            T = T * (1 - alpha)
-        images.append(image)
-        alphas.append(1 - T)
+        order = depths[c].argsort(stable=True)
+        order = order[visible[c, order]]
+        x, y = means2d[c, order, :, None, None].unbind(1)
+        a, b, d = conics[c, order, :, None, None].unbind(1)
+        dx, dy = xs - x, ys - y
+        q = a * dx * dx + 2 * b * dx * dy + d * dy * dy
+        alpha = (opacities[c, order, None, None] * torch.exp(-0.5 * q)).clamp_max(0.999)
+        alpha = torch.where(alpha >= 1 / 255, alpha, torch.zeros_like(alpha))
+        behind = (1 - alpha).log().cumsum(0).exp()
+        front = torch.cat([torch.ones_like(behind[:1]), behind[:-1]])
+        weights = torch.where(behind > 1e-4, alpha * front, torch.zeros_like(alpha))
+        images.append(torch.einsum("nhw,nd->hwd", weights, colors[c, order]))
+        alphas.append(weights.sum(0))
     return torch.stack(images), torch.stack(alphas)[..., None]
+
+
+def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height):
+    """All of it, with gsplat's culling: by depth, and where a circle of three deviations misses the image."""
+    fx, fy, cx, cy = (Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    margins = [
+        ((-cx - 0.15 * width) / fx, (1.15 * width - cx) / fx),
+        ((-cy - 0.15 * height) / fy, (1.15 * height - cy) / fy),
+    ]
+    means2d, cov, depths = project(means, quats, scales, viewmats, Ks, margins)
+    cov = cov + 0.3 * torch.eye(2).to(cov)
+    inverse = torch.linalg.inv(cov)
+    conics = torch.stack([inverse[..., 0, 0], inverse[..., 0, 1], inverse[..., 1, 1]], -1)
+    with torch.no_grad():
+        radii = (3 * torch.linalg.eigvalsh(cov)[..., 1].sqrt()).ceil()
+        size = torch.tensor([width, height])
+        inside = ((means2d + radii[..., None] > 0) & (means2d - radii[..., None] < size)).all(-1)
+    C, N = depths.shape
+    colors, opacities = colors.expand(C, N, -1), opacities.expand(C, N)
+    return composite(means2d, conics, opacities, colors, depths, (depths > 0.01) & inside, width, height)

@@ -5,7 +5,8 @@ import naive
 import numpy as np
 import pytest
 import torch
-from test_torch_backend import LEAVES, image_and_gradients, scene
+from scenes import LEAVES, image_and_gradients
+from scenes import pixel_scene as scene
 
 pytest.importorskip("numba")
 from splatart_ns.rasterize import torch_backend

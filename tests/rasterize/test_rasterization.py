@@ -1,120 +1,17 @@
 import builtins
 import math
+import sys
 
-import naive
 import pytest
 import torch
+from scenes import HEIGHT, WIDTH
+from scenes import world_scene as scene
 
-from splatart_ns.rasterize.rasterization import default_backend, rasterization, sh_colors
+from splatart_ns.errors import InputError
+from splatart_ns.rasterize.rasterization import default_backend, rasterization, set_backend, sh_colors
 
-WIDTH, HEIGHT = 45, 35
-LEAVES = ("means", "quats", "scales", "opacities", "colors", "viewmats")
-
-
-def scene(N=60, C=1, D=3, seed=0):
-    """A blob in front of C cameras, float64 values that float32 holds exactly."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def randn(*shape):
-        return torch.randn(*shape, generator=generator)
-
-    viewmats = torch.eye(4).repeat(C, 1, 1)
-    viewmats[:, :3, 3] = torch.tensor([0.1, -0.2, 4.0]) + 0.3 * torch.arange(C)[:, None]
-    values = dict(
-        means=randn(N, 3) * 0.7,
-        quats=randn(N, 4),
-        scales=(0.6 * randn(N, 3) - 2).exp(),
-        opacities=randn(N).sigmoid(),
-        colors=randn(N, D).sigmoid(),
-        viewmats=viewmats,
-        Ks=torch.tensor([[50.0, 0, 22], [0, 48, 18], [0, 0, 1]]).repeat(C, 1, 1),
-    )
-    return {k: v.double() for k, v in values.items()} | dict(width=WIDTH, height=HEIGHT)
-
-
-def naive_rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height):
-    fx, fy, cx, cy = (Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    margins = [
-        ((-cx - 0.15 * width) / fx, (1.15 * width - cx) / fx),
-        ((-cy - 0.15 * height) / fy, (1.15 * height - cy) / fy),
-    ]
-    means2d, cov, depths = naive.project(means, quats, scales, viewmats, Ks, margins)
-    inverse = torch.linalg.inv(cov + 0.3 * torch.eye(2).to(cov))
-    conics = torch.stack([inverse[..., 0, 0], inverse[..., 0, 1], inverse[..., 1, 1]], -1)
-    C, N = depths.shape
-    colors, opacities = colors.expand(C, N, -1), opacities.expand(C, N)
-    return naive.composite(means2d, conics, opacities, colors, depths, depths > 0.01, width, height)
-
-
-def image_and_gradients(function, scene, dtype, leaves=LEAVES):
-    scene = {k: v.to(dtype) if torch.is_tensor(v) else v for k, v in scene.items()}
-    for name in leaves:
-        scene[name] = scene[name].clone().requires_grad_()
-    image = torch.cat(function(**scene)[:2], -1)
-    weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
-    return image, torch.autograd.grad(image, [scene[name] for name in leaves], weights)
-
-
-def torch_rasterization(**scene):
-    return rasterization(**scene, backend="torch")
-
-
-def assert_equals_naive(scene, image_tolerance=2e-5, gradient_tolerance=3e-5, leaves=LEAVES):
-    expected, expected_gradients = image_and_gradients(naive_rasterization, scene, torch.float64, leaves)
-    for dtype, shrink in ((torch.float32, 1), (torch.float64, 1e-6)):
-        image, gradients = image_and_gradients(torch_rasterization, scene, dtype, leaves)
-        assert (image - expected).abs().max() <= image_tolerance * shrink
-        for name, gradient, reference in zip(leaves, gradients, expected_gradients, strict=True):
-            assert gradient.isfinite().all(), name
-            assert (gradient - reference).norm() <= gradient_tolerance * shrink * reference.norm() + 1e-15, name
-
-
-def test_image_and_gradients_equal_the_naive_ones_through_the_projection():
-    assert_equals_naive(scene(C=2))
-
-
-def test_opacities_near_and_at_zero_and_one():
-    s = scene()
-    s["opacities"][:30] = torch.tensor([0, 1, 0.9999]).repeat(10)
-    assert_equals_naive(s)
-
-
-def test_gaussians_behind_and_on_the_near_plane():
-    s = scene()
-    s["means"][::2, 2] -= 8.0
-    s["means"][1, 2] = 0.01 - 4.0
-    assert_equals_naive(s)
-
-
-def test_zero_quaternions_are_drawn():
-    s = scene()
-    s["quats"][::2] = 0
-    assert_equals_naive(s, leaves=("means", "scales", "opacities", "colors", "viewmats"))
-    _, (gradient,) = image_and_gradients(torch_rasterization, s, torch.float32, ("quats",))
-    assert gradient.isfinite().all()
-
-
-def test_points():
-    s = scene()
-    s["scales"][:] = 1e-8
-    assert_equals_naive(s, leaves=("means", "opacities", "colors", "viewmats"))
-
-
-def test_needles_and_a_screen_filling_gaussian():
-    s = scene(20)
-    s["scales"][0] = 30.0
-    s["scales"][1] = torch.tensor([30.0, 0.01, 0.01])
-    s["scales"][2:4] = torch.tensor([1.0, 0.001, 0.001])
-    s = {k: v.float().double() if torch.is_tensor(v) else v for k, v in s.items()}
-    assert_equals_naive(s)
-
-
-def test_stacked_on_one_pixel_until_nothing_shines_through():
-    s = scene(1000)
-    s["means"][:, :2] *= 0.001
-    s["scales"][:] = 0.01
-    s["opacities"][:] = 0.9
-    assert_equals_naive(s, leaves=("means", "opacities", "colors", "viewmats"))
+# The package's attribute of that name is the function.
+MODULE = sys.modules["splatart_ns.rasterize.rasterization"]
 
 
 def test_several_cameras_equal_one_at_a_time():
@@ -239,14 +136,26 @@ def test_unsupported_arguments_are_named():
         rasterization(**s, backend="tensorflow")
 
 
-def test_backends_are_chosen_by_device(monkeypatch):
-    default_backend.cache_clear()
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert [default_backend(d) for d in ("cuda", "cpu", "xpu")] == ["gsplat", "torch", "torch"]
-    default_backend.cache_clear()
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
-    assert [default_backend(d) for d in ("cuda", "cpu", "xpu")] == ["gsplat", "numba", "torch"]
-    default_backend.cache_clear()
+@pytest.mark.parametrize("has_numba, expected", [(False, "torch"), (True, "numba")])
+def test_backends_are_chosen_by_device(monkeypatch, has_numba, expected):
+    monkeypatch.setattr(MODULE, "_has_numba", lambda: has_numba)
+    assert [default_backend(d) for d in ("cuda", "cpu", "xpu")] == ["gsplat", expected, "torch"]
+
+
+def test_the_backend_can_be_chosen_for_the_process(monkeypatch):
+    monkeypatch.setattr(MODULE, "_chosen", "auto")
+    set_backend("torch")
+    assert default_backend("cpu") == default_backend() == "torch"
+    set_backend("auto")
+    assert default_backend("cuda") == "gsplat"
+    with pytest.raises(InputError, match="tensorflow"):
+        set_backend("tensorflow")
+    monkeypatch.setattr(MODULE, "_has_numba", lambda: False)
+    with pytest.raises(InputError, match="pip install"):
+        set_backend("numba")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(InputError, match="CUDA"):
+        set_backend("gsplat")
 
 
 def test_cpu_rendering_never_imports_gsplat(monkeypatch):

@@ -1,45 +1,11 @@
 import naive
 import pytest
 import torch
+from scenes import LEAVES, image_and_gradients
+from scenes import pixel_scene as scene
 
 from splatart_ns.rasterize import torch_backend
 from splatart_ns.rasterize.torch_backend import rasterize_to_pixels
-
-
-def scene(C=1, N=120, D=3, width=29, height=21, seed=0):
-    """Random 2D Gaussians, float64, some of them outside the image."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def rand(*shape):
-        return torch.rand(*shape, generator=generator, dtype=torch.float64)
-
-    means2d = rand(C, N, 2) * torch.tensor([width + 8.0, height + 8.0]) - 4
-    L = (rand(C, N, 2, 2) - 0.5) * 12
-    inverse = (L @ L.mT + 0.3 * torch.eye(2)).inverse()
-    conics = torch.stack([inverse[..., 0, 0], inverse[..., 0, 1], inverse[..., 1, 1]], -1)
-    return dict(
-        means2d=means2d,
-        conics=conics,
-        opacities=rand(C, N),
-        colors=rand(C, N, D) - 0.3,
-        depths=rand(C, N) + 1,
-        visible=rand(C, N) > 0.1,
-        width=width,
-        height=height,
-    )
-
-
-LEAVES = ("means2d", "conics", "opacities", "colors")
-
-
-def image_and_gradients(function, scene, dtype):
-    """Image with alpha, and the gradients of a random functional of it."""
-    scene = {k: v.to(dtype) if torch.is_tensor(v) and v.is_floating_point() else v for k, v in scene.items()}
-    for name in LEAVES:
-        scene[name] = scene[name].clone().requires_grad_()
-    image = torch.cat(function(**scene), -1)
-    weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
-    return image, torch.autograd.grad(image, [scene[name] for name in LEAVES], weights)
 
 
 def assert_equals_naive(scene):
