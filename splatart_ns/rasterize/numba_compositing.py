@@ -34,8 +34,8 @@ _X, _Y, _T, _W, _A, _COLOR = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIXELS, 5 * 
 def _alpha(log2_alpha):
     """2^log2_alpha, cut to 0 below 1/255 and to 0.999."""
     exponent = min(max(log2_alpha, np.float32(-9)), _LOG2_ALPHA_MAX)
-    whole = math.floor(exponent)
-    f = exponent - np.float32(whole)
+    whole = np.floor(exponent)
+    f = exponent - whole
     power = ((((_E5 * f + _E4) * f + _E3) * f + _E2) * f + _E1) * f + _E0
     scale = np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
     return power * scale if log2_alpha >= _LOG2_ALPHA_MIN else _ZERO
@@ -77,7 +77,7 @@ def composite(begin, end, worker, bins, colors, render, alphas, depths):
         row, column = (tile // tiles_x) % tiles_y, tile % tiles_x
         left, top = column * TILE + 0.5, row * TILE + 0.5
         _start_tile(work)
-        work[_COLOR:] = _ZERO
+        work[_A:] = _ZERO
         more[:] = _ZERO
         pair = tile_offsets[tile]
         while pair < tile_offsets[tile + 1]:
@@ -96,6 +96,7 @@ def composite(begin, end, worker, bins, colors, render, alphas, depths):
                 weight = weight if alive else _ZERO
                 work[_T + p] = rest if alive else -abs(t)
                 work[_W + p] = weight
+                work[_A + p] += weight
                 work[_COLOR + p] += weight * c0
                 work[_COLOR + PIXELS + p] += weight * c1
                 work[_COLOR + 2 * PIXELS + p] += weight * c2
@@ -116,7 +117,7 @@ def composite(begin, end, worker, bins, colors, render, alphas, depths):
         for i in range(min(TILE, height - row * TILE)):
             for j in range(min(TILE, width - column * TILE)):
                 p = i * TILE + j
-                alphas[camera, row * TILE + i, column * TILE + j, 0] = _ONE - abs(work[_T + p])
+                alphas[camera, row * TILE + i, column * TILE + j, 0] = work[_A + p]
                 for d in range(min(channels, MIN_CHANNELS)):
                     render[camera, row * TILE + i, column * TILE + j, d] = work[_COLOR + d * PIXELS + p]
                 for d in range(MIN_CHANNELS, channels):

@@ -30,7 +30,7 @@ class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, sh, centers, degree):
         C, N = len(centers), len(means)
-        arrays = [t.detach().contiguous().numpy() for t in (means, sh.reshape(-1, N, *sh.shape[-2:]), centers)]
+        arrays = [t.detach().contiguous().numpy() for t in (means, sh if sh.ndim == 4 else sh[None], centers)]
         colors = np.empty((C, N, 3), np.float32)
         run(_colors, even_bounds(N, num_workers()), *arrays, degree, colors)
         ctx.state = arrays, colors, degree, sh.shape

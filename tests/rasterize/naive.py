@@ -35,18 +35,9 @@ def project(means, quats, scales, viewmats, Ks, margins):
 
 def composite(means2d, conics, opacities, colors, depths, visible, width, height):
     """Front to back over black, one camera after another, all Gaussians at every pixel."""
-    ys, xs = torch.meshgrid(*(torch.arange(n).to(means2d) + 0.5 for n in (height, width)), indexing="ij")
     images, alphas = [], []
     for c in range(len(means2d)):
-        order = depths[c].argsort(stable=True)
-        order = order[visible[c, order]]
-        x, y = means2d[c, order, :, None, None].unbind(1)
-        a, b, d = conics[c, order, :, None, None].unbind(1)
-        dx, dy = xs - x, ys - y
-        q = a * dx * dx + 2 * b * dx * dy + d * dy * dy
-        alpha = (opacities[c, order, None, None] * torch.exp(-0.5 * q)).clamp_max(0.999)
-        alpha = torch.where(alpha >= 1 / 255, alpha, torch.zeros_like(alpha))
-        behind = (1 - alpha).log().cumsum(0).exp()
+        order, peaks, alpha, behind = _layers(c, means2d, conics, opacities, depths, visible, width, height)
         front = torch.cat([torch.ones_like(behind[:1]), behind[:-1]])
         weights = torch.where(behind > 1e-4, alpha * front, torch.zeros_like(alpha))
         images.append(torch.einsum("nhw,nd->hwd", weights, colors[c, order]))
@@ -54,8 +45,38 @@ def composite(means2d, conics, opacities, colors, depths, visible, width, height
     return torch.stack(images), torch.stack(alphas)[..., None]
 
 
-def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height):
-    """All of it, with gsplat's culling: by depth, and where a circle of three deviations misses the image."""
+def margin(means2d, conics, opacities, colors, depths, visible, width, height):
+    """How near alphas come to the cut at 1/255 and transmittances to that at 1e-4: rounding may jump across them."""
+    least = 1.0
+    for c in range(len(means2d)):
+        _, peaks, _, behind = _layers(c, means2d, conics, opacities, depths, visible, width, height)
+        for value in ((255 * peaks).log(), (1e4 * behind).log()):
+            least = min([least, *value.abs().flatten().tolist()])
+    return least
+
+
+def _layers(c, means2d, conics, opacities, depths, visible, width, height):
+    """Gaussians of camera c from front to back, their alphas [n, H, W] before and after cuts, what they let through."""
+    ys, xs = torch.meshgrid(*(torch.arange(n).to(means2d) + 0.5 for n in (height, width)), indexing="ij")
+    order = depths[c].argsort(stable=True)
+    order = order[visible[c, order]]
+    x, y = means2d[c, order, :, None, None].unbind(1)
+    a, b, d = conics[c, order, :, None, None].unbind(1)
+    dx, dy = xs - x, ys - y
+    q = a * dx * dx + 2 * b * dx * dy + d * dy * dy
+    peaks = opacities[c, order, None, None] * torch.exp(-0.5 * q)
+    alpha = peaks.clamp_max(0.999)
+    alpha = torch.where(alpha >= 1 / 255, alpha, torch.zeros_like(alpha))
+    return order, peaks, alpha, (1 - alpha).log().cumsum(0).exp()
+
+
+def rasterization(**scene):
+    """All of it."""
+    return composite(**projected(**scene))
+
+
+def projected(means, quats, scales, opacities, colors, viewmats, Ks, width, height):
+    """Arguments of `composite`, with gsplat's culling: by depth, and where a circle of 3 sigma misses the image."""
     fx, fy, cx, cy = (Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     margins = [
         ((-cx - 0.15 * width) / fx, (1.15 * width - cx) / fx),
@@ -67,8 +88,15 @@ def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, 
     conics = torch.stack([inverse[..., 0, 0], inverse[..., 0, 1], inverse[..., 1, 1]], -1)
     with torch.no_grad():
         radii = (3 * torch.linalg.eigvalsh(cov)[..., 1].sqrt()).ceil()
-        size = torch.tensor([width, height])
-        inside = ((means2d + radii[..., None] > 0) & (means2d - radii[..., None] < size)).all(-1)
+        inside = (means2d + radii[..., None] > 0) & (means2d - radii[..., None] < torch.tensor([width, height]))
     C, N = depths.shape
-    colors, opacities = colors.expand(C, N, -1), opacities.expand(C, N)
-    return composite(means2d, conics, opacities, colors, depths, (depths > 0.01) & inside, width, height)
+    return dict(
+        means2d=means2d,
+        conics=conics,
+        opacities=opacities.expand(C, N),
+        colors=colors.expand(C, N, -1),
+        depths=depths,
+        visible=(depths > 0.01) & inside.all(-1),
+        width=width,
+        height=height,
+    )
