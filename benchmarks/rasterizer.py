@@ -8,7 +8,9 @@ idle one. The scene is a ball and a box that cover about a third of the image.
 """
 
 import argparse
+import ctypes
 import functools
+import gc
 import importlib.util
 import math
 import re
@@ -166,6 +168,8 @@ def print_memory(count, width, channels, variant):
     torch.set_num_threads(1)
     backends(projected(100, 64, channels), 64, True)[variant]()
     step = backends(projected(count, width, channels), width, True)[variant]
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)  # so that memory that is kept for reuse does not hide what the step needs
     before = resident("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
     step()
