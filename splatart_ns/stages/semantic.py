@@ -46,7 +46,8 @@ def vote_logits(splat: Splat, views: Sequence[View], num_parts: int) -> Tensor:
     for view in views:
         if view.labels is None:
             continue
-        labels = view.labels.to(splat.means.device).long()
+        view = view.to(splat.means.device)
+        labels = view.labels.long()
         labelled = labels != UNLABELLED
         target = torch.nn.functional.one_hot(torch.where(labelled, labels, 0), num_parts + 1).float()
         features = torch.zeros_like(votes, requires_grad=True)
