@@ -1,0 +1,130 @@
+import copy
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.engine.trainer import Trainer
+
+from splatart_ns.capture.capture import UNLABELLED
+from splatart_ns.capture.check import require_valid
+from splatart_ns.capture.view import load_views
+from splatart_ns.errors import InputError
+from splatart_ns.method_configs.pose import method as pose_method
+from splatart_ns.plugin.pose import find_semantic_runs, with_silhouette
+
+
+@pytest.fixture(scope="module")
+def semantic_runs(capture_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
+    """A short splatart-semantic run of each state."""
+    from splatart_ns.method_configs.semantic import method as semantic_method
+
+    runs = []
+    for state in (0, 1):
+        config = copy.deepcopy(semantic_method.config)
+        config.output_dir, config.vis, config.timestamp = tmp_path_factory.mktemp("runs"), "tensorboard", "run"
+        config.logging.local_writer.enable = False
+        config.data = config.pipeline.datamanager.data = capture_dir
+        config.pipeline.datamanager.dataparser.state = state
+        config.max_num_iterations, config.pipeline.model.semantic_start = 66, 60
+        config.pipeline.datamanager.seed_gaussians = 400
+        torch.manual_seed(0)
+        config.save_config()
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        trainer.train()
+        runs.append(config.get_base_dir() / "config.yml")
+    return tuple(runs)
+
+
+@pytest.fixture
+def pose_trainer(capture_dir, semantic_runs, tmp_path):
+    """Makes a Trainer of splatart-pose that is set up and has not begun."""
+
+    def make(steps: int = 6, pose_steps: int = 4, **pipeline) -> Trainer:
+        config = copy.deepcopy(pose_method.config)
+        config.output_dir, config.vis, config.timestamp = tmp_path, "tensorboard", "run"
+        config.logging.local_writer.enable = False
+        config.data = config.pipeline.datamanager.data = capture_dir
+        config.pipeline.semantic_runs = semantic_runs
+        config.pipeline.model.learn_gaussians = pipeline.pop("learn_gaussians", "after")
+        for name, value in pipeline.items():
+            setattr(config.pipeline, name, value)
+        config.max_num_iterations, config.pipeline.model.pose_steps = steps, pose_steps
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        return trainer
+
+    return make
+
+
+def test_poses_start_at_centroids(pose_trainer):
+    T = pose_trainer(init="centroids").pipeline.model.poses.T().detach()
+    assert torch.equal(T[..., :3, :3], torch.eye(3).double().expand(2, 2, 3, 3))
+    assert T[1, 1, :3, 3].norm() > 0.05 > T[1, 0, :3, 3].norm()
+
+
+def test_poses_start_from_a_file_in_the_captures_unit(pose_trainer, capture_dir, tmp_path):
+    capture = require_valid(capture_dir)
+    eye = torch.eye(4)
+    moved = eye.clone()
+    moved[0, 3] = 0.25
+    parts = [{"name": name, "motion": [eye.tolist(), moved.tolist()]} for name in capture.parts.values()]
+    (tmp_path / "motions.json").write_text(json.dumps({"parts": parts}))
+    model = pose_trainer(init="file", init_file=tmp_path / "motions.json").pipeline.model
+    assert torch.allclose(model.poses.T()[1, :, 0, 3], torch.tensor(0.25 * capture.normalization.scale).double())
+
+
+def test_a_missing_file_is_named(pose_trainer):
+    with pytest.raises(InputError, match="init-file"):
+        pose_trainer(init="file")
+
+
+@pytest.mark.parametrize("learn", ["after", "along"])
+def test_gaussians_wait_for_the_poses_or_learn_along(pose_trainer, learn):
+    trainer = pose_trainer(init="centroids", learn_gaussians=learn)
+    model = trainer.pipeline.model
+    colours, poses = model.features_dc.detach().clone(), model.poses.T().detach().clone()
+    seen = {}
+
+    def note(step, **_):
+        if step == 3:
+            seen["colours"], seen["poses"] = model.features_dc.detach().clone(), model.poses.T().detach().clone()
+
+    train_iteration = trainer.train_iteration
+
+    def noted(step):
+        result = train_iteration(step)
+        note(step)
+        return result
+
+    trainer.train_iteration = noted
+    trainer.train()
+    assert not torch.equal(seen["poses"], poses)
+    assert torch.equal(seen["colours"], colours) == (learn == "after")
+    assert model.merged and model.poses.rotation.abs().max() == 0
+    assert torch.isfinite(model.covariance).all()
+
+
+def test_a_run_that_would_never_merge_is_refused(pose_trainer):
+    with pytest.raises(InputError, match="max-num-iterations"):
+        pose_trainer(steps=4, pose_steps=4, init="centroids")
+
+
+def test_semantic_runs_that_are_not_there_are_named_by_state(capture_dir, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="--state 0"):
+        find_semantic_runs(capture_dir, 2)
+
+
+def test_an_opaque_view_takes_its_silhouette_from_its_labels(capture_dir):
+    views = load_views(require_valid(capture_dir), 0)
+    view = next(v for v in views if v.labels is not None)
+    assert with_silhouette(view) is view
+    opaque = replace(view, alpha=None, labels=view.labels.clone())
+    opaque.labels[0, 0] = UNLABELLED
+    made = with_silhouette(opaque)
+    assert torch.equal(made.alpha > 0, (view.labels > 0) & (opaque.labels != UNLABELLED))
+    assert not made.mask[0, 0] and made.mask[1, 1]
+    assert with_silhouette(replace(opaque, labels=None)) is None

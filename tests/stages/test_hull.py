@@ -1,0 +1,70 @@
+from dataclasses import replace
+
+import torch
+from part_scene import box, photograph
+
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.hull import MIN_POINTS_PER_PART, carve, seed_points, visual_hull, vote_by_projection
+
+SIZE = (0.9, 0.6, 0.3)
+BASE, KNOB = box(1, SIZE, (0.0, 0.0, -0.1)), box(2, (0.16, 0.16, 0.16), (0.0, 0.0, 0.3), spacing=0.04)
+VIEWS = photograph(Splat.cat([BASE, KNOB]), count=14)
+
+
+def seeds(seed: int = 0):
+    return seed_points(VIEWS, 2, 500, torch.Generator().manual_seed(seed), resolution=40)
+
+
+def test_the_hull_holds_the_object_and_little_more():
+    voxels, size = visual_hull(VIEWS, resolution=40)
+    inside = (voxels - torch.tensor([0.0, 0.0, -0.1])).abs() <= torch.tensor(SIZE) / 2 - 2 * size
+    box_volume = SIZE[0] * SIZE[1] * SIZE[2]
+    assert inside.all(-1).any()
+    assert 0.8 * box_volume < len(voxels) * size**3 < 3.5 * box_volume  # the images are small
+    assert (voxels.norm(dim=-1) < 0.9).all()
+
+
+def test_what_no_view_sees_or_one_view_sees_through_is_carved():
+    assert carve(VIEWS, torch.tensor([[0.0, 0.0, -0.1], [0.0, 0.6, 0.0], [0.0, 0.0, 50.0]]), 0).tolist() == [
+        True,
+        False,
+        False,
+    ]
+
+
+def test_beyond_the_border_of_a_whole_view_is_outside_and_of_a_cut_view_unknown():
+    beyond = torch.tensor([[0.0, 0.0, 5.0]])
+    view = VIEWS[len(VIEWS) // 2]  # from the side
+    cut = view.to("cpu")
+    cut.alpha = torch.full_like(view.alpha, 255)
+    centre = torch.zeros(1, 3)
+    assert not carve([view], beyond, 0).any()
+    assert carve([cut], centre, 0).all()
+    assert not carve([cut], beyond, 0).any()  # never seen at all
+    assert carve([cut, *VIEWS], torch.tensor([[0.0, 0.0, -0.1]]), 0).all()
+
+
+def test_points_take_the_label_that_most_views_show():
+    points = torch.tensor([[0.0, 0.0, 0.3], [0.4, 0.25, -0.2]])
+    assert vote_by_projection(VIEWS, points, 2).tolist() == [2, 1]
+    silent = [replace(view, labels=None) for view in VIEWS]
+    assert vote_by_projection(silent, points, 2).tolist() == [0, 0]
+
+
+def test_a_small_part_gets_its_least_number_of_points():
+    labels = vote_by_projection(VIEWS, seeds().xyz, 2)
+    assert (labels == 2).sum() > 0.8 * MIN_POINTS_PER_PART[2]
+
+
+def test_points_have_the_colours_of_the_images_and_repeat_by_seed():
+    first, again, other = seeds(), seeds(), seeds(1)
+    assert torch.equal(first.xyz, again.xyz) and not torch.equal(first.xyz, other.xyz)
+    assert first.rgb.shape == first.xyz.shape
+    assert 0 <= first.rgb.min() and first.rgb.max() <= 255 and first.rgb.std() > 5
+
+
+def test_no_silhouette_gives_no_points():
+    empty = [view.to("cpu") for view in VIEWS]
+    for view in empty:
+        view.alpha = torch.zeros_like(view.alpha)
+    assert seed_points(empty, 2, 100, torch.Generator().manual_seed(0)) is None
