@@ -44,6 +44,8 @@ class SemanticModel(SplatartModel):
     def populate_modules(self) -> None:
         super().populate_modules()
         config = self.config
+        reset_every = config.reset_alpha_every * config.refine_every
+        resets = reset_every < config.semantic_start
         self.strategy = DefaultStrategy(
             prune_opa=config.cull_alpha_thresh,
             grow_grad2d=config.densify_grad_thresh,
@@ -54,9 +56,10 @@ class SemanticModel(SplatartModel):
             refine_scale2d_stop_iter=config.stop_screen_size_at,
             refine_start_iter=config.warmup_length,
             refine_stop_iter=min(config.stop_split_at, config.semantic_start),
-            reset_every=config.reset_alpha_every * config.refine_every,
+            reset_every=reset_every,
             refine_every=config.refine_every,
-            pause_refine_after_reset=self.num_train_data + config.refine_every,
+            # The strategy takes the start for a reset; without one there is nothing to wait for.
+            pause_refine_after_reset=self.num_train_data + config.refine_every if resets else 0,
             absgrad=config.use_absgrad,
             verbose=False,
         )

@@ -1,0 +1,43 @@
+import torch
+
+
+def test_growth_stops_at_the_limit(capture_dir, semantic_trainer):
+    trainer = semantic_trainer(capture_dir, steps=40, semantic_start=36)
+    config = trainer.pipeline.model.config
+    start = trainer.pipeline.model.num_points
+    config.max_gaussians, config.densify_grad_thresh = start + 25, 1e-9
+    strategy = trainer.pipeline.model.strategy
+    strategy.refine_start_iter, strategy.refine_every, config.refine_every = 5, 10, 10
+    strategy.prune_opa = 0.0
+    trainer.train()
+    assert start < trainer.pipeline.model.num_points <= start + 25
+
+
+def test_gaussians_outside_the_silhouettes_fade(capture_dir, semantic_trainer):
+    pipeline = semantic_trainer(capture_dir).pipeline
+    model = pipeline.model
+    with torch.no_grad():
+        model.means[:10] = torch.tensor([0.0, 0.0, 5.0])
+    before = model.opacities.detach().clone()
+    model.config.refine_every = 4
+    pipeline._keep_inside(4)
+    assert before[:10].sigmoid().min() > 0.05 > model.opacities[:10].sigmoid().max()
+    kept = model.opacities[10:] == before[10:]
+    assert kept.float().mean() > 0.9
+
+
+def test_only_part_logits_learn_in_the_second_phase(capture_dir, semantic_trainer):
+    trainer = semantic_trainer(capture_dir, steps=12, semantic_start=8)
+    model = trainer.pipeline.model
+    held = {}
+    train_iteration = trainer.train_iteration
+
+    def noted(step):
+        if step == 9:
+            held.update({name: p.detach().clone() for name, p in model.gauss_params.items()})
+        return train_iteration(step)
+
+    trainer.train_iteration = noted
+    trainer.train()
+    changed = {name for name, p in model.gauss_params.items() if not torch.equal(p, held[name])}
+    assert changed == {"semantics"}
