@@ -210,8 +210,7 @@ class PosePipeline(VanillaPipeline):
             shots = []
             for _ in range(2):
                 source, target, view = next(self._pairs)
-                splats = {source: self._frozen_splat(source)}
-                shots.append((carry(splats, T, source, target), view))
+                shots.append((carry({source: self._moving_splat(source)}, T, source, target), view))
         for splat, view in shots:
             rendering = render(
                 splat,
@@ -226,7 +225,7 @@ class PosePipeline(VanillaPipeline):
                 losses[name] = losses.get(name, 0) + loss / len(shots)
         return {}, losses, {"gaussian_count": model.num_points}
 
-    def _frozen_splat(self, state: int) -> Splat:
+    def _moving_splat(self, state: int) -> Splat:
         """What moves while poses are sought: a state's Gaussians without those that straddle two parts."""
         splat = self.model.state_splat(state)
         if self.model.config.learn_gaussians == "along":

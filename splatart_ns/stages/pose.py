@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -94,7 +94,7 @@ def unmixed(splat: Splat, purity: float = 0.9, keep: float = 0.9) -> Tensor:
     return chosen
 
 
-def carry(splats: Sequence[Splat], T: Tensor, source: int, target: int) -> Splat:
+def carry(splats: Sequence[Splat] | Mapping[int, Splat], T: Tensor, source: int, target: int) -> Splat:
     """The splat of state `source` with every part moved to where it is at state `target`.
 
     `T` [S, P, 4, 4] are the poses; the background stays. The Gaussians come in the order of their parts.
