@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
@@ -22,6 +21,7 @@ from splatart_ns.errors import InputError
 from splatart_ns.files import replacing
 from splatart_ns.geometry.camera import viewmat_from_opengl
 from splatart_ns.rasterize.render import Rendering, render
+from splatart_ns.splats.palette import part_colours
 
 Output = Literal["rgb", "depth", "accumulation", "parts"]
 
@@ -38,7 +38,7 @@ def render_frames(
     """Render one frame per configuration on `device`, uint8 [H, W, 3] RGB.
 
     `background` is in 0..1. Depth is shown in colours, red near and blue far, over the depths that the object can have;
-    parts have the colours of `part_colours`; accumulation is grey.
+    parts have the colours of `bundle_colours`; accumulation is grey.
     """
     centre, radius = bounding_sphere(bundle, configurations)
     # The renderer's near plane is a fixed length, so the object is brought to the size of one unit.
@@ -47,7 +47,7 @@ def render_frames(
     viewmat = viewmat_from_opengl(T).float()[None].to(device)
     camera = viewpoint.camera
     K = torch.from_numpy(camera.K).float()[None].to(device)
-    features = (part_features(bundle) @ part_colours(bundle)).to(device)
+    features = (part_features(bundle) @ bundle_colours(bundle)).to(device)
     distance = float(T[:3, 3].norm())
     for configuration in configurations:
         rendering = render(
@@ -78,10 +78,10 @@ def _image(rendering: Rendering, output: Output, background: Tensor, depths: tup
     return image + (1 - accumulation) * background
 
 
-def part_colours(bundle: Bundle) -> Tensor:
-    """A colour per part [P, 3] in 0..1 that depends on its id alone; neighbouring ids differ most."""
-    golden = 0.6180339887498949
-    return torch.tensor([colorsys.hsv_to_rgb((part.id * golden) % 1, 0.65, 0.9) for part in bundle.parts])
+def bundle_colours(bundle: Bundle) -> Tensor:
+    """The colour of each part [P, 3] in 0..1."""
+    ids = torch.tensor([part.id for part in bundle.parts])
+    return part_colours(int(ids.max()))[ids]
 
 
 def write_frames(frames: Iterable[np.ndarray], path: Path, fps: float = 30.0) -> int:

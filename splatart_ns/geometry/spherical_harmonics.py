@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-_C0 = 0.5 / math.sqrt(math.pi)
+SH_C0 = 0.5 / math.sqrt(math.pi)
+"""The constant band; a colour is 0.5 + SH_C0 x its coefficient."""
 _C1 = math.sqrt(3 / (4 * math.pi))
 _C2 = math.sqrt(15 / (4 * math.pi))
 _C3 = (math.sqrt(35 / (32 * math.pi)), math.sqrt(105 / (4 * math.pi)), math.sqrt(21 / (32 * math.pi)))
@@ -27,7 +28,7 @@ def _band(dirs: Tensor, order: int) -> Tensor:
     """Values [2 order + 1, ...] of one band: stacking in front is several times faster."""
     x, y, z = dirs.unbind(-1)
     if order == 0:
-        values = [torch.full_like(x, _C0)]
+        values = [torch.full_like(x, SH_C0)]
     elif order == 1:
         values = [-_C1 * y, _C1 * z, -_C1 * x]
     elif order == 2:

@@ -6,10 +6,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from splatart_ns.geometry.spherical_harmonics import SH_C0
 from splatart_ns.splats.splat import Splat
-
-SH_C0 = 0.28209479177387814
-"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
 
 
 def gauss_params_from_splat(splat: Splat) -> dict[str, nn.Parameter]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -17,14 +16,9 @@ from splatart_ns.plugin.compat import StartView
 from splatart_ns.plugin.gaussians import gauss_params_from_splat, random_splat, splat_from_points
 from splatart_ns.rasterize.render import Rendering, render
 from splatart_ns.rasterize.ssim import ssim
+from splatart_ns.splats.palette import part_colours
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.semantic import part_image
-
-
-def part_colours(count: int) -> Tensor:
-    """Colours [count + 1, 3] of background (black) and parts, evenly spread hues."""
-    hues = [colorsys.hsv_to_rgb((0.61803 * k) % 1, 0.75, 0.95) for k in range(count)]
-    return torch.tensor([(0.0, 0.0, 0.0), *hues])
 
 
 @dataclass

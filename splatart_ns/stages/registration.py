@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from splatart_ns.geometry.spherical_harmonics import SH_C0
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.visibility import shown
 
@@ -63,8 +64,7 @@ def part_points(splat: Splat, seen: Tensor, part: int) -> PartPoints:
     chosen = splat.part_ids == part
     chosen &= shown(torch.where(chosen, seen, 0.0))
     part_splat = splat.select(chosen).detach().to("cpu")
-    # 0.28209 is the constant spherical harmonic.
-    rgb = 0.5 + 0.28209479177387814 * part_splat.sh[:, 0].double().numpy()
+    rgb = 0.5 + SH_C0 * part_splat.sh[:, 0].double().numpy()
     weight = seen[chosen].cpu() * part_splat.part_probabilities[:, part]
     return PartPoints(part_splat.means.double().numpy(), rgb, weight.double().numpy())
 

@@ -3,7 +3,7 @@ import pytest
 import torch
 from PIL import Image
 
-from splatart_ns.bundle.animation import part_colours, render_frames, write_frames
+from splatart_ns.bundle.animation import bundle_colours, render_frames, write_frames
 from splatart_ns.bundle.viewpoint import Viewpoint, bounding_sphere, orbit_viewpoint
 from splatart_ns.errors import InputError
 
@@ -40,7 +40,7 @@ def test_parts_have_their_colours(bundle, view):
         part.splat.opacity_logits[:] = 8.0
     (frame,) = render_frames(bundle, [{}], view, "parts", background=(0.0, 0.0, 0.0))
     pixels = torch.from_numpy(frame).float().reshape(-1, 3) / 255
-    distances = torch.cdist(part_colours(bundle), pixels).amin(1)
+    distances = torch.cdist(bundle_colours(bundle), pixels).amin(1)
     assert (distances < 0.06).all()
 
 

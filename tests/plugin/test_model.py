@@ -11,7 +11,8 @@ from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 
 from splatart_ns.errors import InputError
-from splatart_ns.plugin.model import SplatartModel, part_colours
+from splatart_ns.plugin.model import SplatartModel
+from splatart_ns.splats.palette import part_colours
 
 GEOMETRY = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
 
