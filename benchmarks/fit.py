@@ -3,7 +3,8 @@
 Usage:
     python benchmarks/fit.py CAPTURE [CAPTURE ...] --quality draft standard --output-dir /somewhere
 
-Every fit runs in a process of its own, by the real command. Errors are means over the joints.
+Every fit runs in a process of its own, by the real command. Errors are means over the
+joints; "right" counts joints with the right type and parent.
 """
 
 import json
@@ -15,10 +16,11 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-COLUMNS = ("capture", "quality", "seconds", "axis deg", "turn deg", "slide %R", "types, parents", "PSNR dB", "part IoU")
+COLUMNS = ("capture", "quality", "s", "axis\ndeg", "turn\ndeg", "slide\n% R", "right", "PSNR\ndB", "part\nIoU")
 
 
 @dataclass
@@ -34,7 +36,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    table = Table(*COLUMNS)
+    table = Table(*COLUMNS, box=SIMPLE_HEAD, pad_edge=False)
     for capture in options.captures:
         for quality in options.quality:
             bundle = options.output_dir / f"{capture.name}_{quality}"
