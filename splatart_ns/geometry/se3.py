@@ -98,22 +98,3 @@ def adjoint(T: Tensor) -> Tensor:
     R = T[..., :3, :3]
     top = torch.cat([R, skew(T[..., :3, 3]) @ R], -1)
     return torch.cat([top, torch.cat([torch.zeros_like(R), R], -1)], -2)
-
-
-def orthonormalize(M: Tensor) -> Tensor:
-    """The nearest rotations [..., 3, 3] in the Frobenius norm to matrices [..., 3, 3], by SVD.
-
-    First derivatives are exact where the nearest rotation R is unique. They come from the condition that M R^T be
-    symmetric, and not from the SVD, whose own derivatives are infinite at every rotation (equal singular values).
-    """
-    with torch.no_grad():
-        U, _, Vh = torch.linalg.svd(M)
-        flip = torch.ones_like(M[..., 0])
-        flip[..., 2] = torch.linalg.det(U @ Vh).sign()
-        R = (U * flip[..., None, :]) @ Vh
-        S = M @ R.mT
-        system = S.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] * torch.eye(3).to(M) - (S + S.mT) / 2
-        system = torch.linalg.pinv(system)
-    A = M @ R.mT
-    twist = torch.stack([A[..., 2, 1] - A[..., 1, 2], A[..., 0, 2] - A[..., 2, 0], A[..., 1, 0] - A[..., 0, 1]], -1)
-    return so3_exp((system @ (twist - twist.detach())[..., None])[..., 0]) @ R

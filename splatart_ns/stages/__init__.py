@@ -1,6 +1,6 @@
 """The stages from labelled images to an articulated object: plain functions of plain data."""
 
-from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics, pose_splat
+from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.joint import JointFit, fit_joint
 from splatart_ns.stages.tree import build_tree, choose_root, fit_pairs, infer_tree
 
@@ -14,5 +14,4 @@ __all__ = [
     "fit_pairs",
     "forward_kinematics",
     "infer_tree",
-    "pose_splat",
 ]

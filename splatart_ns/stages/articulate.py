@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.joint import JointFit
 
 
@@ -88,8 +87,3 @@ def forward_kinematics(
         value = q[..., column[id(joint)]] if id(joint) in column else torch.zeros_like(root[..., 0, 0])
         motions[joint.child] = motions[joint.parent] @ joint.fit.motion(value)
     return torch.stack([motions.get(p, root) for p in tree.part_ids], -3)
-
-
-def pose_splat(part_splats: Mapping[int, Splat], motions: Mapping[int, Tensor]) -> Splat:
-    """The splat of the whole object, its parts moved by `motions` [4, 4]; both by part id."""
-    return Splat.cat([splat.transformed(motions[part]) for part, splat in part_splats.items()])

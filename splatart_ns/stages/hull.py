@@ -11,6 +11,7 @@ from torch import Tensor
 
 from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.view import View
+from splatart_ns.geometry.camera import project_points
 
 MIN_POINTS_PER_PART = {2: 2000, 6: 1000}
 """Least number of points of a part, by the number of parts up to which it holds."""
@@ -49,11 +50,9 @@ def carve(views: Sequence[View], grid: Tensor, dilate: int) -> Tensor:
 
 def _project(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Pixel column and row [N] (clamped into the image) and whether the point falls into it."""
-    x = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-    z = x[:, 2].clamp_min(1e-6)
-    u = (view.K[0, 0] * x[:, 0] / z + view.K[0, 2]).floor()
-    v = (view.K[1, 1] * x[:, 1] / z + view.K[1, 2]).floor()
-    visible = (x[:, 2] > 1e-6) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
+    pixels, depth = project_points(points, view.viewmat, view.K)
+    u, v = pixels.floor().unbind(-1)
+    visible = (depth > 0) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
     return u.clamp(0, view.width - 1).long(), v.clamp(0, view.height - 1).long(), visible
 
 

@@ -134,20 +134,3 @@ def test_inverse_and_points():
     assert torch.allclose(se3.inverse(T), torch.linalg.inv(T), rtol=0, atol=1e-14)
     homogeneous = torch.cat([x, torch.ones(20, 1, dtype=x.dtype)], -1)
     assert torch.allclose(se3.transform_points(T, x), (homogeneous @ T.mT)[..., :3], rtol=0, atol=1e-14)
-
-
-@seeds
-@settings(max_examples=25, deadline=None)
-def test_orthonormalize_finds_the_nearest_rotation(seed):
-    generator = torch.Generator().manual_seed(seed)
-    M = torch.randn(8, 3, 3, generator=generator, dtype=torch.float64)
-    R = se3.orthonormalize(M)
-    assert torch.allclose(R @ R.mT, torch.eye(3, dtype=R.dtype), rtol=0, atol=1e-13)
-    assert torch.allclose(torch.linalg.det(R), torch.ones(8, dtype=R.dtype), rtol=0, atol=1e-13)
-    others = se3.so3_exp(0.1 * torch.randn(8, 3, generator=generator, dtype=torch.float64)) @ R
-    assert ((M - R).square().sum((-2, -1)) <= (M - others).square().sum((-2, -1))).all()
-
-
-def test_orthonormalize_has_exact_derivatives_at_a_rotation():
-    M = torch.stack([torch.eye(3), torch.diag(torch.tensor([1.2, 0.9, 0.5]))]).double().requires_grad_()
-    assert torch.autograd.gradcheck(se3.orthonormalize, M)

@@ -4,8 +4,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatart_ns.geometry.se3 import se3_exp
-from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics, pose_splat
+from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.joint import JointFit
 
 
@@ -89,19 +88,3 @@ def test_a_tree_without_movable_joints_stays():
     T = forward_kinematics(still, torch.zeros(7, 0), clamp=True)
     assert torch.equal(T, torch.eye(4).expand(7, 2, 4, 4))
     assert still.observed().shape == (3, 0)
-
-
-def test_posing_moves_every_part_by_its_own_motion():
-    def splat(x):
-        return Splat(
-            torch.tensor([[x, 0.0, 0.0]]),
-            torch.tensor([[1.0, 0, 0, 0]]),
-            torch.zeros(1, 3),
-            torch.zeros(1),
-            torch.zeros(1, 1, 3),
-        )
-
-    motions = {1: torch.eye(4), 2: torch.tensor(turn([0, 0, np.pi / 2], np.zeros(3)))}
-    posed = pose_splat({2: splat(1.0), 1: splat(5.0)}, motions)
-    assert torch.allclose(posed.means, torch.tensor([[0.0, 1, 0], [5, 0, 0]]), atol=1e-6)
-    assert torch.allclose(posed.quats[0].abs(), torch.tensor([0.5**0.5, 0, 0, 0.5**0.5]), atol=1e-6)
