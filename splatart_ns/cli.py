@@ -22,6 +22,7 @@ from splatart_ns.errors import InputError
 
 CONSOLE = Console()
 Quality = Literal["draft", "standard", "high"]
+Rasterizer = Literal["auto", "torch", "numba", "gsplat"]
 
 
 def fit(
@@ -30,6 +31,7 @@ def fit(
     quality: Quality = "standard",
     root: str | None = None,
     seed: int = 0,
+    rasterizer: Rasterizer = "auto",
 ) -> None:
     """Fit an articulated splat to a capture: all stages, resumed after the last finished one.
 
@@ -39,10 +41,12 @@ def fit(
         quality: draft is fast, high is slow.
         root: Name of the part that the others hang on; chosen when not given.
         seed: Seed of everything random.
+        rasterizer: auto takes gsplat on CUDA, else numba where it is installed, else torch.
     """
+    _choose_rasterizer(rasterizer)
     from splatart_ns.plugin.fit import fit as run
 
-    CONSOLE.print(f"Bundle: {run(capture, output_dir, quality, root, seed)}")
+    CONSOLE.print(f"Bundle: {run(capture, output_dir, quality, root, seed, rasterizer)}")
 
 
 def render(
@@ -60,6 +64,7 @@ def render(
     data: Path | None = None,
     camera: int = 0,
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    rasterizer: Rasterizer = "auto",
 ) -> None:
     """Render a bundle in one configuration, in a sweep of each joint, or along a trajectory.
 
@@ -78,6 +83,7 @@ def render(
         data: Folder of the capture, to look through one of its cameras instead.
         camera: Number of that camera in state 0.
         background: Colour behind the object, 0 to 1.
+        rasterizer: As in `splatart fit`.
     """
     from splatart_ns.bundle import animation, configurations, load_bundle, viewpoint
     from splatart_ns.capture.formats import load_capture
@@ -85,6 +91,7 @@ def render(
     if sweep and trajectory is not None:
         raise InputError("--sweep and --trajectory are both given; choose one.")
     _check_numbers(frames, fps, resolution, azimuth, elevation, background)
+    _choose_rasterizer(rasterizer)
     loaded = load_bundle(bundle)
     base = configurations.parse_settings(sum(set, ()), loaded)
     if trajectory is not None:
@@ -122,13 +129,15 @@ def _check_numbers(
             raise InputError(f"--{name} is {value}; give {mend}.")
 
 
-def evaluate(bundle: Annotated[Path, tyro.conf.Positional], data: Path) -> None:
+def evaluate(bundle: Annotated[Path, tyro.conf.Positional], data: Path, rasterizer: Rasterizer = "auto") -> None:
     """Compare a bundle with a capture's ground truth and test views; writes metrics.json into the bundle.
 
     Args:
         bundle: Folder that `splatart fit` left.
         data: Folder of the capture.
+        rasterizer: As in `splatart fit`.
     """
+    _choose_rasterizer(rasterizer)
     from splatart_ns.evaluation.evaluate import evaluate as run
     from splatart_ns.evaluation.tables import format_tables
 
@@ -195,6 +204,16 @@ def demo(output_dir: Path = Path("demo"), object: Literal[OBJECTS] = "hinge", qu
     evaluate(bundle, capture)
     render(bundle, output_dir / "sweep.gif", sweep=True, frames=40, fps=20, resolution=256, azimuth=-50)
     CONSOLE.print(f"Look at {output_dir / 'sweep.gif'}; the bundle is {bundle}")
+
+
+def _choose_rasterizer(rasterizer: Rasterizer) -> None:
+    import torch
+
+    from splatart_ns.rasterize.rasterization import default_backend, set_backend
+
+    set_backend(rasterizer)
+    if default_backend() == "torch" and _device() == "cpu":
+        torch.set_num_threads(1)  # its operations are so small that waking a second thread takes longer
 
 
 def _device() -> str:

@@ -7,11 +7,13 @@ import shutil
 import imageio
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.procedural import write_object
 from splatart_ns.capture.synthesis import SynthesisOptions
+from splatart_ns.rasterize.rasterization import default_backend, set_backend
 
 JOINT = "base_to_lid"
 SMALL = ("--resolution", 48)
@@ -193,10 +195,37 @@ def test_synth_renders_a_robot_and_its_own_objects(start_splatart, run_main, tmp
         assert (tmp_path / name / "ground_truth.json").is_file()
 
 
+@pytest.fixture
+def restore_rasterizer():
+    """After the test, what this process rasterizes with is as before."""
+    threads = torch.get_num_threads()
+    yield
+    set_backend("auto")
+    torch.set_num_threads(threads)
+
+
+def test_the_rasterizer_can_be_chosen(render, tmp_path, restore_rasterizer):
+    pictures = []
+    for backend in ("numba", "torch"):
+        render(tmp_path / backend, "--rasterizer", backend)
+        assert default_backend() == backend
+        pictures.append(picture(tmp_path / backend / "frame_0000.png"))
+    assert abs(pictures[0] - pictures[1]).max() <= 1
+    assert_shows_an_object(pictures[0])
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is CUDA here")
+def test_a_rasterizer_that_cannot_run_is_refused_before_any_work(run_main, hinge_capture, tmp_path):
+    arguments = "fit", hinge_capture, "--output-dir", tmp_path / "out", "--rasterizer", "gsplat"
+    code, _, errors = run_main(*arguments)
+    assert code == 2 and "CUDA" in errors and "Traceback" not in errors
+    assert not (tmp_path / "out").exists()
+
+
 def test_demo_goes_from_nothing_to_a_film(run_main, monkeypatch, hinge_fit, tmp_path):
     """With the fit itself, which has tests of its own, replaced by a finished one."""
 
-    def fit(capture, output_dir, quality, root, seed):
+    def fit(capture, output_dir, quality, root, seed, rasterizer):
         assert (capture / "ground_truth.json").is_file()
         return shutil.copytree(hinge_fit, output_dir, dirs_exist_ok=True)
 

@@ -27,6 +27,9 @@ def contents(folder):
     return {f.relative_to(folder): (f.read_bytes(), f.stat().st_mtime_ns) for f in folder.rglob("*") if f.is_file()}
 
 
+SETTINGS = {"quality": "draft", "root": None, "seed": 0, "rasterizer": "auto"}
+
+
 def results(folder):
     """The bytes of what a fit is for."""
     return {f.relative_to(folder): f.read_bytes() for f in [folder / "articulation.json", *folder.glob("parts/*")]}
@@ -45,7 +48,7 @@ def test_the_bundle_is_complete(hinge_fit):
     assert sorted(f.name for f in (hinge_fit / "parts").iterdir()) == ["base.ply", "lid.ply"]
     assert all(len(part.splat) > 100 for part in bundle.parts)
     assert bundle.provenance["seed"] == 0
-    assert bundle.provenance["settings"] == {"quality": "draft", "root": None, "seed": 0}
+    assert bundle.provenance["settings"] == SETTINGS
     assert sorted(f.name for f in hinge_fit.iterdir()) == ["articulation.json", "parts", "report.json", "runs"]
 
 
@@ -67,7 +70,7 @@ def test_the_report_tells_what_every_stage_took(hinge_fit):
     for stage in report["stages"]:
         assert all(stage[key] > 0 for key in ("seconds", "iterations", "gaussians", "peak_memory_mb"))
     assert report["seconds"] == pytest.approx(sum(stage["seconds"] for stage in report["stages"]), abs=0.01)
-    assert report["settings"] == {"quality": "draft", "root": None, "seed": 0}
+    assert report["settings"] == SETTINGS
     assert {"python", "torch", "nerfstudio", "splatart-ns"} <= set(report["versions"])
     assert report["stages"][-1]["gaussians"] == sum(len(part.splat) for part in load_bundle(hinge_fit).parts)
 
@@ -148,8 +151,9 @@ class TestResuming:
         from splatart_ns.capture.formats import load_capture
         from splatart_ns.plugin.fit import Report, Settings
 
-        def make(bundle, capture, quality="draft", root=None, seed=0):
-            return Report(bundle / "report.json", load_capture(capture), Settings(quality, root, seed))
+        def make(bundle, capture, quality="draft", root=None, seed=0, rasterizer="auto"):
+            settings = Settings(quality, root, seed, rasterizer)
+            return Report(bundle / "report.json", load_capture(capture), settings)
 
         return make
 
@@ -157,7 +161,7 @@ class TestResuming:
         again = report(fit_copy, hinge_capture)
         assert all(again.resume(stage, whole=True) for stage in STAGES)
 
-    @pytest.mark.parametrize("other", [{"seed": 1}, {"quality": "high"}])
+    @pytest.mark.parametrize("other", [{"seed": 1}, {"quality": "high"}, {"rasterizer": "torch"}])
     def test_none_with_other_settings(self, report, fit_copy, hinge_capture, other):
         assert not report(fit_copy, hinge_capture, **other).resume(STAGES[0], whole=True)
         assert finished_stages(fit_copy) == []

@@ -32,7 +32,7 @@ from splatart_ns.method_configs.joint import method as joint_method
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.method_configs.semantic import method as semantic_method
 from splatart_ns.plugin.compat import seed_everything
-from splatart_ns.rasterize.rasterization import default_backend
+from splatart_ns.rasterize.rasterization import Backend, default_backend, set_backend
 
 Quality = Literal["draft", "standard", "high"]
 
@@ -65,6 +65,7 @@ class Settings:
     quality: Quality
     root: str | None
     seed: int
+    rasterizer: Backend = "auto"
 
 
 class Report:
@@ -139,13 +140,19 @@ def _digest(capture: Capture) -> str:
 
 
 def fit(
-    capture_path: Path, output_dir: Path, quality: Quality = "standard", root: str | None = None, seed: int = 0
+    capture_path: Path,
+    output_dir: Path,
+    quality: Quality = "standard",
+    root: str | None = None,
+    seed: int = 0,
+    rasterizer: Backend = "auto",
 ) -> Path:
     """Run what is missing of all stages and leave the bundle in `output_dir`.
 
     Raises:
-        InputError: for a capture, a root or a folder that cannot be used.
+        InputError: for a capture, a root, a folder or a rasterizer that cannot be used.
     """
+    set_backend(rasterizer)
     capture = require_valid(capture_path)
     if root is not None and root not in capture.parts.values():
         raise InputError(
@@ -154,7 +161,7 @@ def fit(
     if not 0 <= seed < 2**32:
         raise InputError(f"--seed is {seed}; give 0 to {2**32 - 1}.")
     output_dir = output_dir.absolute()
-    settings = Settings(quality, root, seed)
+    settings = Settings(quality, root, seed, rasterizer)
     report = Report(output_dir / "report.json", capture, settings)
     try:
         (output_dir / "runs").mkdir(parents=True, exist_ok=True)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from splatart_ns.geometry.camera import viewmat_from_opengl
 from splatart_ns.plugin.compat import StartView
 from splatart_ns.plugin.gaussians import gauss_params_from_splat, random_splat, splat_from_points
+from splatart_ns.rasterize.rasterization import Backend, set_backend
 from splatart_ns.rasterize.render import Rendering, render
 from splatart_ns.rasterize.ssim import ssim
 from splatart_ns.splats.palette import part_colours
@@ -36,6 +37,8 @@ class SplatartModelConfig(SplatfactoModelConfig):
     """Degree of the spherical harmonics; higher ones pay where surfaces shine."""
     lpips: bool = False
     """Whether evaluation computes LPIPS, whose weights are downloaded on first use."""
+    rasterizer: Backend = "auto"
+    """For the whole process; auto: what was chosen before, else gsplat on CUDA, numba where installed, torch."""
 
 
 class SplatartModel(SplatfactoModel):
@@ -45,6 +48,8 @@ class SplatartModel(SplatfactoModel):
 
     def populate_modules(self) -> None:
         """Gaussians from seed points or at random, strategy and metrics; nothing is downloaded."""
+        if self.config.rasterizer != "auto":
+            set_backend(self.config.rasterizer)
         metadata = self.kwargs["metadata"]
         self.part_names = metadata["part_names"]
         self.num_parts = len(self.part_names) - 1
