@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from splatart_ns.rasterize.numba_binning import bin_gaussians
-from splatart_ns.rasterize.numba_compositing import MIN_CHANNELS, composite, composite_backward, gather_gradients
+from splatart_ns.rasterize.numba_compositing import GROUP, composite, composite_backward, gather_gradients
 from splatart_ns.rasterize.numba_runtime import balanced_bounds, even_bounds, num_workers, run
 
 
@@ -43,8 +43,9 @@ class _Rasterize(torch.autograd.Function):
         means_, conics_, colors_ = (_array(t).reshape(C * N, t.shape[-1]) for t in (means2d, conics, colors))
         opacities_, depths_, visible_ = (_array(t).ravel() for t in (opacities, depths, visible))
         bins = bin_gaussians(means_, conics_, opacities_, depths_, visible_, C, width, height)
-        if D < MIN_CHANNELS:
-            colors_ = np.pad(colors_, ((0, 0), (0, MIN_CHANNELS - D)))
+        padding = -D % GROUP if D else GROUP
+        if padding:
+            colors_ = np.pad(colors_, ((0, 0), (0, padding)))
         render = np.empty((C, height, width, D), np.float32)
         alphas = np.empty((C, height, width, 1), np.float32)
         used = np.empty(len(bins.tile_offsets) - 1, np.int64)

@@ -2,7 +2,7 @@
 
 A tile's 64 pixels lie side by side in one small workspace, at fixed offsets, so that every inner loop runs over them in
 vector registers: LLVM vectorises them only where it sees that nothing overlaps. The first four channels of colour
-share the workspace and the loops of the geometry; each further channel has a row and loops of its own.
+share the loops of the geometry; each further group of four has one loop of its own.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from splatart_ns.rasterize.numba_binning import PIXELS, TILE
 from splatart_ns.rasterize.numba_runtime import jit
 
-MIN_CHANNELS = 4
-"""The least number of channels: fewer are padded."""
+GROUP = 4
+"""Channels per loop: their number is padded to a multiple of it."""
 
 _LOG2_ALPHA_MIN = np.float32(math.log2(1 / 255))
 _LOG2_ALPHA_MAX = np.float32(math.log2(0.999))
@@ -26,7 +26,7 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 _E0, _E1, _E2 = np.float32(0.9999999250636943), np.float32(0.6931530731907609), np.float32(0.24015361712565741)
 _E3, _E4, _E5 = np.float32(0.05582631781272315), np.float32(0.00898934037714072), np.float32(0.0018775765567582148)
 
-# Offsets in the workspace of a tile.
+# Offsets in the workspace of a tile; the channels' planes come last.
 _X, _Y, _T, _W, _A, _COLOR = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIXELS, 5 * PIXELS
 
 
@@ -53,6 +53,14 @@ def _at_tile(coefficients, left, top):
 
 
 @jit
+def _aligned(count):
+    """Uninitialised floats from the start of a cache line on, so that vectors of 64 bytes straddle none."""
+    floats = np.empty(count + 16, np.float32)
+    start = (-floats.ctypes.data % 64) // 4
+    return floats[start : start + count]
+
+
+@jit
 def _start_tile(work):
     """Fills in the tile-local pixel coordinates and full transmittance."""
     for p in range(PIXELS):
@@ -65,20 +73,20 @@ def _start_tile(work):
 def composite(begin, end, worker, bins, colors, render, alphas, depths):
     """Renders the tiles begin..end into render [C, H, W, D] and alphas [C, H, W, 1].
 
-    colors are [G, max(D, MIN_CHANNELS)]. depths [tiles] receives how many pairs of each tile
+    colors are [G, D padded to a multiple of GROUP]. depths [tiles] receives how many pairs of each tile
     were used before all its pixels were saturated.
     """
     tiles_x, tiles_y, tile_offsets, gaussians = bins.tiles_x, bins.tiles_y, bins.tile_offsets, bins.gaussians
     coefficients = bins.coefficients
     height, width, channels = render.shape[1], render.shape[2], render.shape[3]
-    work = np.empty(_COLOR + MIN_CHANNELS * PIXELS, np.float32)
-    more = np.empty((colors.shape[1] - MIN_CHANNELS, PIXELS), np.float32)
+    work = _aligned(_COLOR + colors.shape[1] * PIXELS)
+    planes = work[_COLOR:].reshape((-1, PIXELS))
+    groups = work[_COLOR:].reshape((-1, GROUP * PIXELS))
     for tile in range(begin, end):
         row, column = (tile // tiles_x) % tiles_y, tile % tiles_x
         left, top = column * TILE + 0.5, row * TILE + 0.5
         _start_tile(work)
         work[_A:] = _ZERO
-        more[:] = _ZERO
         pair = tile_offsets[tile]
         while pair < tile_offsets[tile + 1]:
             g = gaussians[pair]
@@ -101,10 +109,15 @@ def composite(begin, end, worker, bins, colors, render, alphas, depths):
                 work[_COLOR + PIXELS + p] += weight * c1
                 work[_COLOR + 2 * PIXELS + p] += weight * c2
                 work[_COLOR + 3 * PIXELS + p] += weight * c3
-            for d in range(more.shape[0]):
-                c = colors[g, MIN_CHANNELS + d]
+            for i in range(1, groups.shape[0]):
+                d, group = GROUP * i, groups[i]
+                c0, c1, c2, c3 = colors[g, d], colors[g, d + 1], colors[g, d + 2], colors[g, d + 3]
                 for p in range(PIXELS):
-                    more[d, p] += work[_W + p] * c
+                    weight = work[_W + p]
+                    group[p] += weight * c0
+                    group[PIXELS + p] += weight * c1
+                    group[2 * PIXELS + p] += weight * c2
+                    group[3 * PIXELS + p] += weight * c3
             pair += 1
             if pair & 7 == 0:
                 most = -_ONE
@@ -114,21 +127,22 @@ def composite(begin, end, worker, bins, colors, render, alphas, depths):
                     break
         depths[tile] = pair - tile_offsets[tile]
         camera = tile // (tiles_x * tiles_y)
+        wide = min(TILE, width - column * TILE)
         for i in range(min(TILE, height - row * TILE)):
-            for j in range(min(TILE, width - column * TILE)):
-                p = i * TILE + j
-                alphas[camera, row * TILE + i, column * TILE + j, 0] = work[_A + p]
-                for d in range(min(channels, MIN_CHANNELS)):
-                    render[camera, row * TILE + i, column * TILE + j, d] = work[_COLOR + d * PIXELS + p]
-                for d in range(MIN_CHANNELS, channels):
-                    render[camera, row * TILE + i, column * TILE + j, d] = more[d - MIN_CHANNELS, p]
+            target = render[camera, row * TILE + i, column * TILE :]
+            for d in range(channels):
+                plane = planes[d, i * TILE :]
+                for j in range(wide):
+                    target[j, d] = plane[j]
+            for j in range(wide):
+                alphas[camera, row * TILE + i, column * TILE + j, 0] = work[_A + i * TILE + j]
 
 
 @jit
 def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alphas, wants, moments, v_colors):
     """Gradients of the tiles begin..end's pairs, by slot.
 
-    wants: whether to fill moments, its columns for absgrad, and v_colors [E, max(D, MIN_CHANNELS)].
+    wants: whether to fill moments, its columns for absgrad, and v_colors [E, padded D].
     moments [E, 6 or 8], with v the gradient of a pixel's ln(alpha) and u = dx + s dy, are the sums over the tile of v
     times 1, u, dy, u^2, u dy, dy^2, and the absolute gradients of the mean's x and y.
     """
@@ -142,9 +156,10 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
     coefficients = bins.coefficients
     want_moments, want_abs, want_colors = wants
     height, width, channels = v_render.shape[1], v_render.shape[2], v_render.shape[3]
-    work = np.empty(_COLOR + MIN_CHANNELS * PIXELS, np.float32)
-    more = np.empty((colors.shape[1] - MIN_CHANNELS, PIXELS), np.float32)
-    saved = np.empty((1024, 2 * PIXELS), np.float32)
+    work = _aligned(_COLOR + colors.shape[1] * PIXELS)
+    planes = work[_COLOR:].reshape((-1, PIXELS))
+    groups = work[_COLOR:].reshape((-1, GROUP * PIXELS))
+    saved = _aligned(1024 * 2 * PIXELS).reshape((-1, 2 * PIXELS))
     for tile in range(begin, end):
         row, column = (tile // tiles_x) % tiles_y, tile % tiles_x
         left, top = column * TILE + 0.5, row * TILE + 0.5
@@ -158,7 +173,7 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
             continue
         _start_tile(work)
         if count > saved.shape[0]:
-            saved = np.empty((2 * count, 2 * PIXELS), np.float32)
+            saved = _aligned(2 * count * 2 * PIXELS).reshape((-1, 2 * PIXELS))
         for k in range(count):
             g = gaussians[start + k]
             u0, y0, square, shear, drop, peak = _at_tile(coefficients[g], left, top)
@@ -179,88 +194,89 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
                 save[PIXELS + p] = weight if alive else _ZERO
         camera = tile // (tiles_x * tiles_y)
         work[_COLOR:] = _ZERO
-        more[:] = _ZERO
         # The transmittance is no longer needed; in its place comes the gradient of alpha, 0 beyond the image's edge.
         for p in range(PIXELS):
             work[_T + p] = _ZERO
             work[_A + p] = _ZERO
+        wide = min(TILE, width - column * TILE)
         for i in range(min(TILE, height - row * TILE)):
-            for j in range(min(TILE, width - column * TILE)):
-                p = i * TILE + j
-                work[_T + p] = v_alphas[camera, row * TILE + i, column * TILE + j, 0]
-                for d in range(min(channels, MIN_CHANNELS)):
-                    work[_COLOR + d * PIXELS + p] = v_render[camera, row * TILE + i, column * TILE + j, d]
-                for d in range(MIN_CHANNELS, channels):
-                    more[d - MIN_CHANNELS, p] = v_render[camera, row * TILE + i, column * TILE + j, d]
+            source = v_render[camera, row * TILE + i, column * TILE :]
+            for d in range(channels):
+                plane = planes[d, i * TILE :]
+                for j in range(wide):
+                    plane[j] = source[j, d]
+            for j in range(wide):
+                work[_T + i * TILE + j] = v_alphas[camera, row * TILE + i, column * TILE + j, 0]
         # work[_A] holds what lies behind the pair, composited and dotted with the image gradient.
         for k in range(count - 1, -1, -1):
             g, slot = gaussians[start + k], slots[start + k]
             save = saved[k]
+            u0, y0, square, shear, drop, peak = _at_tile(coefficients[g], left, top)
+            for p in range(PIXELS):
+                work[_W + p] = work[_T + p]
+            for i in range(1, groups.shape[0]):
+                d, group = GROUP * i, groups[i]
+                c0, c1, c2, c3 = colors[g, d], colors[g, d + 1], colors[g, d + 2], colors[g, d + 3]
+                v0, v1, v2, v3 = _ZERO, _ZERO, _ZERO, _ZERO
+                for p in range(PIXELS):
+                    weight = save[PIXELS + p]
+                    g0, g1, g2, g3 = group[p], group[PIXELS + p], group[2 * PIXELS + p], group[3 * PIXELS + p]
+                    work[_W + p] += c0 * g0 + c1 * g1 + c2 * g2 + c3 * g3
+                    v0 += weight * g0
+                    v1 += weight * g1
+                    v2 += weight * g2
+                    v3 += weight * g3
+                if want_colors:
+                    v_colors[slot, d] = v0
+                    v_colors[slot, d + 1] = v1
+                    v_colors[slot, d + 2] = v2
+                    v_colors[slot, d + 3] = v3
+            c0, c1, c2, c3 = colors[g, 0], colors[g, 1], colors[g, 2], colors[g, 3]
+            m, mu, my, muu, muy, myy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+            v0, v1, v2, v3 = _ZERO, _ZERO, _ZERO, _ZERO
+            for p in range(PIXELS):
+                alpha, weight = save[p], save[PIXELS + p]
+                g0, g1 = work[_COLOR + p], work[_COLOR + PIXELS + p]
+                g2, g3 = work[_COLOR + 2 * PIXELS + p], work[_COLOR + 3 * PIXELS + p]
+                v0 += weight * g0
+                v1 += weight * g1
+                v2 += weight * g2
+                v3 += weight * g3
+                difference = work[_W + p] + c0 * g0 + c1 * g1 + c2 * g2 + c3 * g3 - work[_A + p]
+                work[_A + p] += abs(alpha) * difference
+                v = weight * difference if alpha > _ZERO else _ZERO
+                work[_W + p] = v
+                dy = work[_Y + p] + y0
+                u = work[_X + p] + (shear * work[_Y + p] + u0)
+                vu, vy = v * u, v * dy
+                m += v
+                mu += vu
+                my += vy
+                muu += vu * u
+                muy += vu * dy
+                myy += vy * dy
             if want_moments:
-                for p in range(PIXELS):
-                    work[_W + p] = work[_T + p]
-                for d in range(more.shape[0]):
-                    c = colors[g, MIN_CHANNELS + d]
-                    for p in range(PIXELS):
-                        work[_W + p] += more[d, p] * c
-                c0, c1, c2, c3 = colors[g, 0], colors[g, 1], colors[g, 2], colors[g, 3]
-                u0, y0, square, shear, drop, _ = _at_tile(coefficients[g], left, top)
-                m, mu, my, muu, muy, myy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
-                for p in range(PIXELS):
-                    alpha = save[p]
-                    color = (
-                        work[_W + p]
-                        + c0 * work[_COLOR + p]
-                        + c1 * work[_COLOR + PIXELS + p]
-                        + c2 * work[_COLOR + 2 * PIXELS + p]
-                        + c3 * work[_COLOR + 3 * PIXELS + p]
-                    )
-                    difference = color - work[_A + p]
-                    work[_A + p] += abs(alpha) * difference
-                    v = save[PIXELS + p] * difference if alpha > _ZERO else _ZERO
-                    work[_W + p] = v
-                    dy = work[_Y + p] + y0
-                    u = work[_X + p] + (shear * work[_Y + p] + u0)
-                    vu, vy = v * u, v * dy
-                    m += v
-                    mu += vu
-                    my += vy
-                    muu += vu * u
-                    muy += vu * dy
-                    myy += vy * dy
                 moments[slot, 0] = m
                 moments[slot, 1] = mu
                 moments[slot, 2] = my
                 moments[slot, 3] = muu
                 moments[slot, 4] = muy
                 moments[slot, 5] = myy
-                if want_abs:
-                    ax, ay = _ZERO, _ZERO
-                    for p in range(PIXELS):
-                        v = work[_W + p]
-                        dy = work[_Y + p] + y0
-                        slope_x = square * (work[_X + p] + (shear * work[_Y + p] + u0))
-                        ax += abs(v * slope_x)
-                        ay += abs(v * (shear * slope_x + drop * dy))
-                    moments[slot, 6] = ax
-                    moments[slot, 7] = ay
             if want_colors:
-                v0, v1, v2, v3 = _ZERO, _ZERO, _ZERO, _ZERO
-                for p in range(PIXELS):
-                    weight = save[PIXELS + p]
-                    v0 += weight * work[_COLOR + p]
-                    v1 += weight * work[_COLOR + PIXELS + p]
-                    v2 += weight * work[_COLOR + 2 * PIXELS + p]
-                    v3 += weight * work[_COLOR + 3 * PIXELS + p]
                 v_colors[slot, 0] = v0
                 v_colors[slot, 1] = v1
                 v_colors[slot, 2] = v2
                 v_colors[slot, 3] = v3
-                for d in range(more.shape[0]):
-                    v0 = _ZERO
-                    for p in range(PIXELS):
-                        v0 += save[PIXELS + p] * more[d, p]
-                    v_colors[slot, MIN_CHANNELS + d] = v0
+            if want_moments and want_abs:
+                ax, ay = _ZERO, _ZERO
+                for p in range(PIXELS):
+                    v = work[_W + p]
+                    dy = work[_Y + p] + y0
+                    slope_x = square * (work[_X + p] + (shear * work[_Y + p] + u0))
+                    ax += abs(v * slope_x)
+                    ay += abs(v * (shear * slope_x + drop * dy))
+                moments[slot, 6] = ax
+                moments[slot, 7] = ay
 
 
 @jit
