@@ -12,7 +12,7 @@ from splatart_ns.plugin.datamanager import SplatartDatamanagerConfig
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.plugin.pose import PoseModelConfig, PosePipelineConfig
 
-POSE_STEPS = 200
+DESCENT_STEPS = 200
 MERGE_STEPS = 400
 
 
@@ -27,16 +27,16 @@ method = MethodSpecification(
         steps_per_eval_batch=0,
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,
-        max_num_iterations=POSE_STEPS + MERGE_STEPS,
+        max_num_iterations=MERGE_STEPS,
         mixed_precision=False,
         pipeline=PosePipelineConfig(
             datamanager=SplatartDatamanagerConfig(dataparser=SplatartDataParserConfig()),
-            model=PoseModelConfig(pose_steps=POSE_STEPS),
+            model=PoseModelConfig(),
         ),
         optimizers={
             "part_poses": {
                 "optimizer": AdamOptimizerConfig(lr=3e-3, eps=1e-15),
-                "scheduler": ExponentialDecaySchedulerConfig(lr_final=1e-4, max_steps=POSE_STEPS),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=1e-4, max_steps=DESCENT_STEPS),
             },
             # Of the merged Gaussians: they are nearly right.
             "means": _adam(2e-4),

@@ -45,16 +45,14 @@ class Effort:
     """Gaussians that each state starts from."""
     steps: int
     """Steps on geometry and colour of each state."""
-    pose_steps: int
-    """Steps on the poses, Gaussians frozen."""
     merge_steps: int
     """Steps on the merged Gaussians of all states."""
 
 
 EFFORTS: dict[Quality, Effort] = {
-    "draft": Effort(gaussians=4000, steps=400, pose_steps=100, merge_steps=150),
-    "standard": Effort(gaussians=8000, steps=1000, pose_steps=200, merge_steps=400),
-    "high": Effort(gaussians=16000, steps=3000, pose_steps=400, merge_steps=1500),
+    "draft": Effort(gaussians=4000, steps=400, merge_steps=150),
+    "standard": Effort(gaussians=8000, steps=1000, merge_steps=400),
+    "high": Effort(gaussians=16000, steps=3000, merge_steps=1500),
 }
 
 
@@ -203,9 +201,7 @@ def _pose_config(capture: Capture, semantic_runs: list[Path], effort: Effort, se
     config = copy.deepcopy(pose_method.config)
     config.pipeline.semantic_runs = tuple(semantic_runs)
     config.pipeline.seed = seed
-    config.pipeline.model.pose_steps = effort.pose_steps
-    config.optimizers["part_poses"]["scheduler"].max_steps = effort.pose_steps
-    config.max_num_iterations = effort.pose_steps + effort.merge_steps
+    config.max_num_iterations = config.pipeline.model.pose_steps + effort.merge_steps
     return _with_data(config, capture, 0, seed)
 
 

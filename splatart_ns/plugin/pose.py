@@ -25,7 +25,7 @@ from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
-from splatart_ns.stages.pose_evidence import motion_covariances, rotation_held_ratios
+from splatart_ns.stages.pose_evidence import refine_poses, rotation_held_ratios
 from splatart_ns.stages.render_choice import initial_motion
 from splatart_ns.stages.visibility import visibility
 
@@ -35,8 +35,9 @@ class PoseModelConfig(SplatartModelConfig):
     """Poses by rendering every state's parts at every other state, then Gaussians merged from all states."""
 
     _target: type = field(default_factory=lambda: PoseModel)
-    pose_steps: int = 200
-    """Steps on the poses; after them the Gaussians of all states are merged and learn."""
+    pose_steps: int = 0
+    """Steps of gradient descent on the poses, as in the paper; poses that start from registration need none. Then they
+    are refined on all views by Gauss-Newton, and the Gaussians of all states are merged and learn."""
     learn_gaussians: Literal["after", "along"] = "after"
     """Whether Gaussians wait until the poses are found, or learn along with them as in the paper."""
     loss_weights: PoseLossWeights = field(default_factory=PoseLossWeights)
@@ -254,12 +255,12 @@ class PosePipeline(VanillaPipeline):
 
     @torch.no_grad()
     def _merge(self, optimizers: dict[str, torch.optim.Optimizer]) -> None:
-        """End the search for poses: note their certainty, then keep one set of Gaussians, in the canonical frame."""
+        """End the search for poses, then keep one set of Gaussians, in the canonical frame."""
         model = self.model
-        model.poses.commit()
-        T = model.poses.T()
         splats = [model.state_splat(s).detach() for s in range(model.num_states)]
-        model.covariance = motion_covariances(splats, self.views, T)
+        frozen = torch.cat([torch.ones_like(model.poses.free[:1]), ~model.poses.free])
+        T, model.covariance = refine_poses(splats, self.views, model.poses.T(), frozen)
+        model.poses.commit(T)
         model.held_ratio = rotation_held_ratios(splats, self.views, T)
         merged = Splat.cat(merge_parts(splats, self.views, T))
         params = gauss_params_from_splat(merged)

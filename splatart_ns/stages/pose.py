@@ -56,9 +56,9 @@ class PartPoses(nn.Module):
         return torch.cat([self.base[:1], small @ self.base[1:]])
 
     @torch.no_grad()
-    def commit(self) -> None:
-        """Make the present poses the base and the increments zero."""
-        self.base.copy_(self.T())
+    def commit(self, T: Tensor) -> None:
+        """Make the poses T [S, P, 4, 4] the base and the increments zero."""
+        self.base.copy_(T)
         self.rotation.zero_()
         self.translation.zero_()
 

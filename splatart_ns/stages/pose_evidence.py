@@ -1,4 +1,4 @@
-"""What the images say of finished poses: how certain they are, and which parts could as well only slide."""
+"""What all images say of the poses: where exactly they are, how certain, and which parts could as well only slide."""
 
 from __future__ import annotations
 
@@ -12,25 +12,47 @@ from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import inverse, so3_log
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import part_pair
-from splatart_ns.stages.refinement import motion_covariance, rotation_held_ratio
+from splatart_ns.stages.refinement import motion_covariance, refine, rotation_held_ratio
 from splatart_ns.stages.render_choice import FINE_PIXELS, VIEWS
 
+ALL_VIEWS = 60
+"""Views of each state that the last refinement looks at, where there are so many."""
+MAX_ITERATIONS = 8
 MAYBE_SLIDING = math.radians(10)
 """A part that turned less than this against another may be sliding: thin parts' turns are known no better."""
 
 
-def motion_covariances(splats: Sequence[Splat], views: Sequence[Sequence[View]], T: Tensor) -> Tensor:
-    """Covariances [S, P, 6, 6] of the poses T [S, P, 4, 4]: T = se3_exp(xi) T_true, xi = (translation, rotation).
+def refine_poses(
+    splats: Sequence[Splat], views: Sequence[Sequence[View]], T: Tensor, frozen: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The last rung of the search for poses: Gauss-Newton on all views, and the certainty that they give.
 
-    NaN for a part that no labelled view shows; 0 at state 0.
+    Few views leave the turn of a round part to chance, and the colours of a photometric loss mislead it, because light
+    stays in the world while parts turn; the silhouettes of all views hold it.
+
+    Args:
+        splats: One labelled splat per state.
+        views: Training views of each state.
+        T: Poses [S, P, 4, 4], near the optimum.
+        frozen: Which of them stay as they are [S, P] bool.
+
+    Returns:
+        The refined poses, and their covariances [S, P, 6, 6]: T = se3_exp(xi) T_true, xi = (translation, rotation). NaN
+        for a part that no labelled view shows; 0 at state 0.
     """
+    T = T.clone()
     S, P = T.shape[:2]
-    out = torch.zeros(S, P, 6, 6, dtype=torch.float64, device=T.device)
+    covariances = torch.zeros(S, P, 6, 6, dtype=torch.float64, device=T.device)
     for s in range(1, S):
         for p in range(P):
-            pair = part_pair((splats[0], splats[s]), (views[0], views[s]), p + 1, VIEWS, FINE_PIXELS)
-            out[s, p] = torch.nan if pair is None else motion_covariance(pair, T[s, p])
-    return out
+            pair = part_pair((splats[0], splats[s]), (views[0], views[s]), p + 1, ALL_VIEWS, FINE_PIXELS)
+            if pair is None:
+                covariances[s, p] = torch.nan
+                continue
+            if not frozen[s, p]:
+                T[s, p] = refine(pair, T[s, p], MAX_ITERATIONS).T
+            covariances[s, p] = motion_covariance(pair, T[s, p])
+    return T, covariances
 
 
 def rotation_held_ratios(splats: Sequence[Splat], views: Sequence[Sequence[View]], T: Tensor) -> Tensor:

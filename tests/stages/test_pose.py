@@ -75,7 +75,7 @@ def test_commit_keeps_the_poses_and_zeroes_the_increments():
         p.rotation.normal_()
         p.translation.normal_()
     before = p.T().detach()
-    p.commit()
+    p.commit(p.T().detach())
     assert torch.allclose(p.T(), before, atol=1e-12)
     assert not p.rotation.any() and not p.translation.any()
 
