@@ -170,14 +170,15 @@ def synth(
     """Render a capture with ground truth from any URDF.
 
     Args:
-        robot: The URDF file, or the name of a built-in object (see `splatart demo`).
+        robot: The URDF file, or the name of a built-in object (see `splatart demo`), or random-SEED[-PARTS]
+            for a random one.
         output_dir: A folder that does not exist yet, or is empty.
         options: How it is rendered.
     """
-    from splatart_ns.capture.procedural import synthesize_object
+    from splatart_ns.capture.procedural import is_object_name, synthesize_object
     from splatart_ns.capture.synthesis import synthesize
 
-    if str(robot) in OBJECTS and not robot.exists():
+    if is_object_name(str(robot)) and not robot.exists():
         synthesize_object(str(robot), output_dir, options)
     else:
         synthesize(robot, output_dir, options)
