@@ -31,6 +31,7 @@ def fit(
     quality: Quality = "standard",
     root: str | None = None,
     seed: int = 0,
+    joint: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     rasterizer: Rasterizer = "auto",
 ) -> None:
     """Fit an articulated splat to a capture: all stages, resumed after the last finished one.
@@ -41,12 +42,14 @@ def fit(
         quality: draft is fast, high is slow.
         root: Name of the part that the others hang on; chosen when not given.
         seed: Seed of everything random.
+        joint: What you know of a joint, by the parts' names: child:parent, child:parent=revolute (or another type),
+            child:parent=none (there is none) or child:parent=not-revolute.
         rasterizer: auto takes gsplat on CUDA, else numba where it is installed, else torch.
     """
     _choose_rasterizer(rasterizer)
     from splatart_ns.plugin.fit import fit as run
 
-    CONSOLE.print(f"Bundle: {run(capture, output_dir, quality, root, seed, rasterizer)}")
+    CONSOLE.print(f"Bundle: {run(capture, output_dir, quality, root, seed, rasterizer, joint)}")
 
 
 def render(

@@ -27,7 +27,7 @@ def contents(folder):
     return {f.relative_to(folder): (f.read_bytes(), f.stat().st_mtime_ns) for f in folder.rglob("*") if f.is_file()}
 
 
-SETTINGS = {"quality": "draft", "root": None, "seed": 0, "rasterizer": "auto"}
+SETTINGS = {"quality": "draft", "root": None, "seed": 0, "rasterizer": "auto", "joints": []}
 
 
 def results(folder):
@@ -143,6 +143,15 @@ def test_another_root_takes_the_last_stage_only(fit_copy, hinge_capture, run_mai
     assert finished_stages(fit_copy) == STAGES
 
 
+def test_the_users_word_on_a_joint_holds(fit_copy, hinge_capture, run_main):
+    arguments = ("fit", hinge_capture, "--output-dir", fit_copy, "--quality", "draft")
+    assert run_main(*arguments, "--joint", "lid:base=prismatic")[0] == 0
+    assert [joint.type for joint in load_bundle(fit_copy).joints] == ["prismatic"]
+    assert finished_stages(fit_copy) == STAGES
+    code, _, errors = run_main(*arguments, "--joint", "lid:body")
+    assert code == 2 and "body" in errors and "base, lid" in errors
+
+
 class TestResuming:
     """What of an earlier run counts."""
 
@@ -151,8 +160,8 @@ class TestResuming:
         from splatart_ns.capture.formats import load_capture
         from splatart_ns.plugin.fit import Report, Settings
 
-        def make(bundle, capture, quality="draft", root=None, seed=0, rasterizer="auto"):
-            settings = Settings(quality, root, seed, rasterizer)
+        def make(bundle, capture, quality="draft", root=None, seed=0, rasterizer="auto", joints=()):
+            settings = Settings(quality, root, seed, rasterizer, joints)
             return Report(bundle / "report.json", load_capture(capture), settings)
 
         return make

@@ -8,9 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from splatart_ns.splats.splat import Splat
-
-JOINT_DOFS = {"revolute": 1, "prismatic": 1, "screw": 1, "cylindrical": 2, "spherical": 3, "fixed": 0, "free": 6}
-"""Degrees of freedom by joint type."""
+from splatart_ns.stages.joint import JOINT_DOFS as JOINT_DOFS
 
 
 @dataclass
@@ -53,8 +51,8 @@ class Joint:
     residual: float = 0.0
     """Mean distance of the child's points between the observed motion and the joint's, length."""
     covariance: dict[str, Any] = field(default_factory=dict)
-    """Blocks as nested lists: "axis", "origin" (across the axis), "axis_origin", all [3, 3], and "values" [S, S]; None
-    where undetermined."""
+    """Blocks as nested lists: "axis", "origin" (across the axis), "axis_origin", all [3, 3], and "values" [S, S] or
+    [S D, S D]; None where undetermined."""
     ambiguous: bool = False
     alternatives: list[dict[str, Any]] = field(default_factory=list)
     """Other types that were tried: {"type", "residual", "score"}."""

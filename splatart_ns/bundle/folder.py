@@ -188,14 +188,14 @@ def _read_joint(record: Record, num_states: int, parts: list[str]) -> Joint:
         pitch=record.number("pitch"),
         in_tree=record.flag("in_tree"),
         residual=residual,
-        covariance=_read_covariance(record.record("covariance"), num_states),
+        covariance=_read_covariance(record.record("covariance"), num_states * max(dofs, 1)),
         ambiguous=record.flag("ambiguous"),
         alternatives=alternatives,
     )
 
 
-def _read_covariance(record: Record, num_states: int) -> dict[str, Any]:
-    shapes = {"axis": (3, 3), "origin": (3, 3), "axis_origin": (3, 3), "values": (num_states, num_states)}
+def _read_covariance(record: Record, num_values: int) -> dict[str, Any]:
+    shapes = {"axis": (3, 3), "origin": (3, 3), "axis_origin": (3, 3), "values": (num_values, num_values)}
     for name, block in record.fields.items():
         if name not in shapes:
             record.fail(name, "is unknown", f"known are {', '.join(shapes)}")

@@ -11,10 +11,8 @@ from torch import Tensor
 
 from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
 from splatart_ns.capture.capture import Normalization
-from splatart_ns.geometry.screw import Screw
-from splatart_ns.geometry.se3 import from_rotation_translation, se3_exp, so3_exp
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.joint import joint_motion as one_value_motion
+from splatart_ns.stages import joint as stage
 
 JointValue = float | Sequence[float] | Tensor
 """Radians or length; as many numbers as the joint has degrees of freedom, in the order of `Joint.values`."""
@@ -26,16 +24,7 @@ def joint_motion(joint: Joint, value: JointValue) -> Tensor:
     dofs = JOINT_DOFS[joint.type]
     if value.shape not in ({torch.Size([])} if dofs <= 1 else {torch.Size([dofs])}):
         raise ValueError(f"joint '{joint.name}' is {joint.type} and takes {dofs} values, not shape {list(value.shape)}")
-    match joint.type:
-        case "cylindrical":
-            return Screw(joint.axis, joint.origin, value[1], value[0]).motion()
-        case "spherical":
-            R = so3_exp(value)
-            return from_rotation_translation(R, joint.origin - R @ joint.origin)
-        case "free":
-            return se3_exp(value)
-        case kind:
-            return one_value_motion(kind, joint.axis, joint.origin, joint.pitch, value)
+    return stage.joint_motion(joint.type, joint.axis, joint.origin, joint.pitch, value)
 
 
 def configured_motions(bundle: Bundle, q: Mapping[str, JointValue]) -> dict[str, Tensor]:

@@ -64,7 +64,8 @@ def covers(joint: Joint, axis: Tensor, origin: Tensor) -> bool | None:
     plane through the joint's origin across it: 4 degrees of freedom, 2 for prismatic.
     """
     names = ("axis",) if joint.type == "prismatic" else ("axis", "axis_origin", "origin")
-    if joint.type not in (*_TURNING, "prismatic") or any(joint.covariance.get(name) is None for name in names):
+    types = (*_TURNING, "cylindrical", "prismatic")
+    if joint.type not in types or any(joint.covariance.get(name) is None for name in names):
         return None
     blocks = {name: torch.as_tensor(joint.covariance[name], dtype=torch.float64) for name in names}
     across = torch.linalg.svd(joint.axis[None]).Vh[1:]

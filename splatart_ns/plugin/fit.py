@@ -33,6 +33,7 @@ from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.method_configs.semantic import method as semantic_method
 from splatart_ns.plugin.compat import seed_everything
 from splatart_ns.rasterize.rasterization import Backend, default_backend, set_backend
+from splatart_ns.stages.tree import parse_constraints
 
 Quality = Literal["draft", "standard", "high"]
 
@@ -64,6 +65,7 @@ class Settings:
     root: str | None
     seed: int
     rasterizer: Backend = "auto"
+    joints: tuple[str, ...] = ()
 
 
 class Report:
@@ -74,7 +76,7 @@ class Report:
         self.data: dict[str, Any] = {
             "capture": str(capture.path.absolute()),
             "capture_sha256": _digest(capture),
-            "settings": asdict(settings),
+            "settings": asdict(settings) | {"joints": list(settings.joints)},
             "seed": settings.seed,
             "device": "cuda: " + torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
             "rasterizer": default_backend(),
@@ -95,8 +97,11 @@ class Report:
             ]
             had, wanted = earlier["settings"], self.data["settings"]
             same = all(earlier.get(key) == self.data[key] for key in ("capture", "capture_sha256"))
-            same = same and {**had, "root": None} == {**wanted, "root": None}
-            if had["root"] != wanted["root"]:  # the last stage alone asks for it
+            last = ("root", "joints")  # the last stage alone asks for them
+            same = same and {k: v for k, v in had.items() if k not in last} == {
+                k: v for k, v in wanted.items() if k not in last
+            }
+            if any(had.get(k) != wanted[k] for k in last):
                 stages = [stage for stage in stages if stage["name"] != "joint"]
         except (OSError, ValueError, LookupError, TypeError, AttributeError):
             raise InputError(
@@ -144,11 +149,12 @@ def fit(
     root: str | None = None,
     seed: int = 0,
     rasterizer: Backend = "auto",
+    joints: tuple[str, ...] = (),
 ) -> Path:
     """Run what is missing of all stages and leave the bundle in `output_dir`.
 
     Raises:
-        InputError: for a capture, a root, a folder or a rasterizer that cannot be used.
+        InputError: for a capture, a root, a joint, a folder or a rasterizer that cannot be used.
     """
     set_backend(rasterizer)
     capture = require_valid(capture_path)
@@ -156,10 +162,11 @@ def fit(
         raise InputError(
             f"{capture_path} has no part '{root}'; choose --root from {', '.join(capture.parts.values())}."
         )
+    parse_constraints(joints, capture.parts, next((p for p, name in capture.parts.items() if name == root), None))
     if not 0 <= seed < 2**32:
         raise InputError(f"--seed is {seed}; give 0 to {2**32 - 1}.")
     output_dir = output_dir.absolute()
-    settings = Settings(quality, root, seed, rasterizer)
+    settings = Settings(quality, root, seed, rasterizer, joints)
     report = Report(output_dir / "report.json", capture, settings)
     try:
         (output_dir / "runs").mkdir(parents=True, exist_ok=True)
@@ -210,8 +217,9 @@ def _joint_config(capture: Capture, pose_run: Path, bundle: Path, settings: Sett
     config.bundle_dir = bundle
     config.pipeline.pose_run = pose_run
     config.pipeline.root = settings.root
+    config.pipeline.joints = settings.joints
     config.pipeline.seed = settings.seed
-    config.pipeline.settings = asdict(settings)
+    config.pipeline.settings = asdict(settings) | {"joints": list(settings.joints)}
     return _with_data(config, capture, 0, settings.seed)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,22 +14,24 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerSlider
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from splatart_ns.bundle.assemble import assemble_bundle
 from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.folder import save_bundle
 from splatart_ns.capture.capture import Normalization
 from splatart_ns.errors import InputError
+from splatart_ns.geometry.se3 import se3_exp, se3_log
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint
 from splatart_ns.plugin.gaussians import gauss_params_from_splat, splat_from_state
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
-from splatart_ns.stages.joint import JointFit
+from splatart_ns.stages.joint import JOINT_DOFS, JointFit
 from splatart_ns.stages.pose import carry
-from splatart_ns.stages.tree import EPSILON, JointMethod, infer_tree
+from splatart_ns.stages.tree import EPSILON, JointMethod, infer_tree, parse_constraints
 
-JOINT_TYPES = ("revolute", "prismatic", "screw", "fixed")
+JOINT_TYPES = ("revolute", "prismatic", "screw", "fixed", "cylindrical", "spherical", "free")
 MIN_POINT_OPACITY = 0.3
 """Fainter Gaussians say little of where a part's surface is."""
 
@@ -59,7 +61,7 @@ class JointModel(SplatartModel):
             "joint_axes": torch.zeros(0, 3, **double),
             "joint_origins": torch.zeros(0, 3, **double),
             "joint_pitches": torch.zeros(0, **double),
-            "joint_values": torch.zeros(0, 1, **double),
+            "joint_values": torch.zeros(0, 1, 6, **double),  # joint, state, degree of freedom
             "root": torch.tensor(1),
             "motions": torch.zeros(1, 1, 4, 4, **double),
         }
@@ -72,13 +74,12 @@ class JointModel(SplatartModel):
         """Show `splat` (normalised world) on `tree`; tree and motions [S, P, 4, 4] are in the capture's world."""
         self.gauss_params = nn.ParameterDict(gauss_params_from_splat(splat.to(self.device)))
         scale = normalization.scale
-        fits = [j.fit for j in tree.joints]
+        fits = [replace(j.fit, values=normal_values(j.fit, normalization)) for j in tree.joints]
         buffers = self._no_joints() | {
             "root": torch.tensor(tree.root),
             "motions": torch.from_numpy(normalization.motion_to_normal(motions.cpu().numpy())),
         }
         if fits:
-            lengths = torch.tensor([scale if f.type == "prismatic" else 1.0 for f in fits]).double()
             buffers |= {
                 "joint_parts": torch.tensor([[j.parent, j.child] for j in tree.joints]),
                 "joint_types": torch.tensor([JOINT_TYPES.index(f.type) for f in fits]),
@@ -86,7 +87,7 @@ class JointModel(SplatartModel):
                 "joint_origins": scale
                 * (torch.stack([f.origin for f in fits]) - torch.from_numpy(normalization.centre)),
                 "joint_pitches": torch.tensor([f.pitch * scale for f in fits]).double(),
-                "joint_values": torch.stack([f.values for f in fits]) * lengths[:, None],
+                "joint_values": torch.stack([pad(f.values.reshape(len(f.values), -1), (0, 6))[:, :6] for f in fits]),
             }
         self._set_joints(buffers)
         self.add_sliders(scale)
@@ -104,23 +105,25 @@ class JointModel(SplatartModel):
             self.joint_values,
             strict=True,
         ):
+            dofs = JOINT_DOFS[JOINT_TYPES[kind]]
+            values = values[:, :dofs] if dofs > 1 else values[:, 0]
             fit = JointFit(JOINT_TYPES[kind], axis, origin, pitch, values, residual=0.0)
             joints.append(Joint(*parts, fit))
         return KinematicTree(list(range(1, self.num_parts + 1)), int(self.root), joints)
 
     def add_sliders(self, scale: float) -> None:
-        """One slider for each joint that moves, in degrees or the capture's unit, over the observed range and half
+        """One slider for each degree of freedom, in degrees or the capture's unit, over the observed range and half
         as much on both sides. `scale` is the normalisation's."""
         self.register_buffer("world_scale", torch.tensor(scale, dtype=torch.float64, device=self.device))
         length_unit = self.kwargs["metadata"]["length_unit"]
-        for index, joint in enumerate(self.tree.movable):
-            turns = joint.fit.type != "prismatic"
+        tree = self.tree
+        for index, ((joint, what, turns), observed) in enumerate(zip(_freedoms(tree), tree.observed().mT, strict=True)):
             unit = math.degrees(1) if turns else 1 / scale
-            low, high, step = slider_range(*(limit * unit for limit in joint.fit.limits))
+            low, high, step = slider_range(*(float(x) * unit for x in (observed.min(), observed.max())))
             slider = ViewerSlider(
-                name=f"{self.part_names[joint.parent]}_to_{self.part_names[joint.child]} "
+                name=f"{self.part_names[joint.parent]}_to_{self.part_names[joint.child]}{what} "
                 f"({'degree' if turns else 'length' if length_unit == 'unknown' else length_unit})",
-                default_value=float(joint.fit.values[self._shown_state(joint.fit.values)]) * unit,
+                default_value=float(observed[min(self.state, len(observed) - 1)]) * unit,
                 min_value=low,
                 max_value=high,
                 step=step,
@@ -128,15 +131,11 @@ class JointModel(SplatartModel):
             # The viewer finds attributes, not lists of them, and shows them in the order of their names.
             setattr(self, f"joint_{index:02d}", slider)
 
-    def _shown_state(self, values: Tensor) -> int:
-        return min(self.state, values.shape[-1] - 1)
-
     def configuration(self) -> Tensor:
         """What the sliders say [J], radians and normalised length."""
         q = []
-        for index, joint in enumerate(self.tree.movable):
+        for index, (_, _, turns) in enumerate(_freedoms(self.tree)):
             value = getattr(self, f"joint_{index:02d}").value
-            turns = joint.fit.type != "prismatic"
             q.append(math.radians(value) if turns else value * float(self.world_scale))
         return torch.tensor(q, dtype=torch.float64, device=self.device)
 
@@ -155,6 +154,27 @@ class JointModel(SplatartModel):
         self._set_joints({name: state[name] for name in self._no_joints()})
         self.add_sliders(float(state["world_scale"]))
         return super().load_state_dict(state, **kwargs)
+
+
+def _freedoms(tree: KinematicTree) -> list[tuple[Joint, str, bool]]:
+    """A tree's degrees of freedom in the order of a configuration: the joint, what its slider is called besides the
+    joint, and whether the value is an angle."""
+    turns = [(f" turn {axis}", True) for axis in "xyz"]
+    slides = [(f" {axis}", False) for axis in "xyz"]
+    several = {"cylindrical": [(" slide", False), (" turn", True)], "spherical": turns, "free": slides + turns}
+    return [
+        (joint, *freedom)
+        for joint in tree.movable
+        for freedom in several.get(joint.fit.type, [("", joint.fit.type != "prismatic")])
+    ]
+
+
+def normal_values(fit: JointFit, normalization: Normalization) -> Tensor:
+    """A joint's values in the normalised world."""
+    if fit.type == "free":
+        return se3_log(torch.from_numpy(normalization.motion_to_normal(se3_exp(fit.values).numpy(force=True))))
+    lengths = {"prismatic": normalization.scale, "cylindrical": torch.tensor([normalization.scale, 1.0]).to(fit.values)}
+    return fit.values * lengths.get(fit.type, 1.0)
 
 
 def slider_range(low: float, high: float) -> tuple[float, float, float]:
@@ -179,6 +199,8 @@ class JointPipelineConfig(VanillaPipelineConfig):
     """The config.yml of the splatart-pose run; the latest one on this capture under outputs/ when not given."""
     root: str | None = None
     """Name of the part that the others hang on; chosen when not given."""
+    joints: tuple[str, ...] = ()
+    """What is known of joints: child:parent, child:parent=type, child:parent=none or child:parent=not-type."""
     epsilon: float = EPSILON
     """Largest residual of an accepted joint, as a share of the object's bounding radius."""
     method: JointMethod = "screw"
@@ -234,6 +256,7 @@ class JointPipeline(VanillaPipeline):
             render_ratios=ratios,
             epsilon=config.epsilon,
             method=config.method,
+            constraints=parse_constraints(config.joints, capture.parts, root),
         )
         self.notes = [f"{capture.parts[part]}: {reason}" for part, reason in self.tree.unattached.items()]
         for note in self.notes:

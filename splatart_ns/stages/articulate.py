@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -41,49 +41,52 @@ class KinematicTree:
     rejected: list[Joint] = field(default_factory=list)
     """Pairs that move like a joint and were not chosen, cheapest first."""
     unattached: dict[int, str] = field(default_factory=dict)
-    """Parts that hang on nothing, each with the reason. They move with the root."""
+    """Parts that no joint explains, each with the reason. They hang on nothing and move with the root, but for those
+    that others hang on: they have a free joint."""
 
     @property
     def movable(self) -> list[Joint]:
-        """The joints of the tree that have a value: the order of a configuration's entries."""
-        return [j for j in self.joints if j.fit.type != "fixed"]
+        """The joints of the tree that have values: the order of a configuration's entries."""
+        return [j for j in self.joints if j.fit.dofs > 0]
 
     def observed(self) -> Tensor:
         """The configurations [S, J] of the observed states; a tree without joints has but one."""
         states = len(self.joints[0].fit.values) if self.joints else 1
-        return (
-            torch.stack([j.fit.values for j in self.movable], -1) if self.movable else torch.zeros(states, 0).double()
-        )
+        values = [j.fit.values.reshape(states, j.fit.dofs) for j in self.movable]
+        return torch.cat(values, -1) if values else torch.zeros(states, 0).double()
 
 
 def forward_kinematics(
     tree: KinematicTree,
-    q: Tensor | Mapping[str, float],
+    q: Tensor | Mapping[str, float | Sequence[float]],
     *,
     root_motion: Tensor | None = None,
     clamp: bool = False,
 ) -> Tensor:
     """Motions [..., P, 4, 4] of all parts, in the order of `tree.part_ids`, from where they are at state 0.
 
-    `q` [..., J]: the values of `tree.movable`, or some of them by joint name, the others 0. `root_motion`
-    [..., 4, 4]: of the root, by default the identity. `clamp` keeps the values within the observed limits.
-    Differentiable in `q` and `root_motion`.
+    `q` [..., J]: the values of `tree.movable` one joint after the other, as many as it has degrees of freedom, or some
+    of them by joint name, the others 0. `root_motion` [..., 4, 4]: of the root, by default the identity. `clamp` keeps
+    the values within the observed limits. Differentiable in `q` and `root_motion`.
     """
     movable = tree.movable
+    dofs = [j.fit.dofs for j in movable]
     if isinstance(q, Mapping):
         if unknown := set(q) - {j.name for j in movable}:
             raise KeyError(f"no movable joint is named {sorted(unknown)}; there are {[j.name for j in movable]}")
-        q = torch.tensor([q.get(j.name, 0.0) for j in movable], dtype=torch.float64)
-    if q.shape[-1] != len(movable):
-        raise ValueError(f"a configuration of {q.shape[-1]} values for {len(movable)} movable joints")
+        values = [torch.as_tensor(q.get(j.name, [0.0] * j.fit.dofs)).double().reshape(j.fit.dofs) for j in movable]
+        q = torch.cat(values) if values else torch.zeros(0).double()
+    if q.shape[-1] != sum(dofs):
+        raise ValueError(f"a configuration of {q.shape[-1]} values for {sum(dofs)} of the movable joints")
     if clamp:
-        limits = torch.tensor([j.fit.limits for j in movable]).reshape(-1, 2).to(q)
-        q = q.clamp(limits[:, 0], limits[:, 1])
+        observed = tree.observed().to(q)
+        q = q.clamp(observed.amin(0), observed.amax(0))
     root = torch.eye(4).to(q) if root_motion is None else root_motion.to(q)
     root = root.expand(*torch.broadcast_shapes(root.shape[:-2], q.shape[:-1]), 4, 4)
     motions = {tree.root: root}
-    column = {id(j): k for k, j in enumerate(movable)}
+    values = {id(j): v for j, v in zip(movable, q.split(dofs, -1), strict=True)}
     for joint in tree.joints:
-        value = q[..., column[id(joint)]] if id(joint) in column else torch.zeros_like(root[..., 0, 0])
+        value = values.get(id(joint), torch.zeros_like(root[..., 0, :1]))
+        value = value[..., 0] if joint.fit.dofs <= 1 else value
         motions[joint.child] = motions[joint.parent] @ joint.fit.motion(value)
     return torch.stack([motions.get(p, root) for p in tree.part_ids], -3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,15 +31,21 @@ class Contact:
         across = torch.linalg.cross(self.points - origin, axis.expand_as(self.points))
         return float(torch.linalg.vector_norm(across, dim=-1).median())
 
+    def distance_to_point(self, point: Tensor) -> float:
+        """Median distance of the contact from a point [3]."""
+        return float(torch.linalg.vector_norm(self.points - point, dim=-1).median())
 
-def find_contacts(points: dict[int, Tensor], motions: dict[int, Tensor]) -> dict[tuple[int, int], Contact]:
-    """Contacts of all pairs (a, b), a < b, of parts with points [N, 3] at state 0 and motions [S, 4, 4].
+
+def find_contacts(
+    points: dict[int, Tensor], motions: dict[int, Tensor], pairs: Iterable[tuple[int, int]] | None = None
+) -> dict[tuple[int, int], Contact]:
+    """Contacts of pairs (a, b), by default all with a < b, of parts with points [N, 3] at state 0, motions [S, 4, 4].
 
     Of a part with more than 2000 points, evenly picked ones are used.
     """
     sampled = {p: x[:: math.ceil(len(x) / _MAX_POINTS)].double() for p, x in points.items()}
     trees = {p: cKDTree(x.numpy(force=True)) for p, x in sampled.items()}
-    pairs = [(a, b) for a in sorted(points) for b in sorted(points) if a < b]
+    pairs = [(a, b) for a in sorted(points) for b in sorted(points) if a < b] if pairs is None else pairs
     return {
         (a, b): _contact(sampled[a], sampled[b], trees[a], trees[b], inverse(motions[a].double()) @ motions[b].double())
         for a, b in pairs

@@ -3,8 +3,9 @@ import math
 import pytest
 import torch
 
-from splatart_ns.bundle import load_bundle, save_bundle
+from splatart_ns.bundle import configured_motions, load_bundle, observed_values, save_bundle
 from splatart_ns.bundle.assemble import assemble_bundle
+from splatart_ns.bundle.configurations import movable_joints, sweep
 from splatart_ns.splats import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree
 from splatart_ns.stages.joint import JointFit
@@ -57,3 +58,28 @@ def test_what_is_assembled_is_a_valid_bundle(assembled, tmp_path):
     save_bundle(assembled, tmp_path)
     assert [j.name for j in load_bundle(tmp_path).tree_joints] == ["body_to_door", "door_to_knob"]
     assert isinstance(assembled.parts[0].splat, Splat)
+
+
+def test_joints_of_more_freedom_are_saved_loaded_and_posed(bundle, tmp_path):
+    generator = torch.Generator().manual_seed(0)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    joints = []
+    for part, (kind, dofs) in enumerate({"cylindrical": 2, "spherical": 3, "free": 6}.items(), start=2):
+        values = torch.cat([torch.zeros(1, dofs).double(), random(3, dofs)])
+        covariance = {"values": torch.eye(4 * dofs).double().tolist()}
+        joints.append(Joint(1, part, JointFit(kind, Z, random(3), 0.0, values, 1e-3, covariance=covariance)))
+    tree = KinematicTree([1, 2, 3, 4], 1, joints)
+    eye = torch.eye(4).double().repeat(4, 1, 1)
+    motions = {1: eye} | {j.child: j.fit.motion(j.fit.values) for j in joints}
+    zeros = {p: torch.zeros(4, 6, 6).double() for p in NAMES}
+    splats = dict.fromkeys(NAMES, bundle.parts[0].splat)
+    save_bundle(assemble_bundle(tree, splats, motions, zeros, NAMES, list("abcd"), "metre", {}), tmp_path)
+    loaded = load_bundle(tmp_path)
+    for state in range(4):
+        posed = configured_motions(loaded, observed_values(loaded, state))
+        for part, name in NAMES.items():
+            assert torch.allclose(posed[name], motions[part][state])
+    assert not movable_joints(loaded) and sweep(loaded, {}, 4) == [{}]

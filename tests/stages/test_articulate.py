@@ -88,3 +88,26 @@ def test_a_tree_without_movable_joints_stays():
     T = forward_kinematics(still, torch.zeros(7, 0), clamp=True)
     assert torch.equal(T, torch.eye(4).expand(7, 2, 4, 4))
     assert still.observed().shape == (3, 0)
+
+
+def test_joints_of_more_freedom_take_their_values_side_by_side():
+    still = torch.zeros(3, dtype=torch.float64)
+    z = torch.tensor([0, 0, 1.0], dtype=torch.float64)
+    values = {
+        "cylindrical": torch.tensor([[0.0, 0], [0.3, 0.5]], dtype=torch.float64),
+        "spherical": torch.tensor([[0.0, 0, 0], [0.1, 0.2, 0.3]], dtype=torch.float64),
+        "free": torch.tensor([[0.0] * 6, [1.0, 2, 3, 0.1, 0.2, 0.3]], dtype=torch.float64),
+    }
+    joints = [Joint(1, k + 2, JointFit(kind, z, still, 0.0, v, 0.0)) for k, (kind, v) in enumerate(values.items())]
+    nod = torch.tensor([0.0, -0.4], dtype=torch.float64)
+    joints.insert(1, Joint(2, 9, JointFit("revolute", z, still, 0.0, nod, 0.0)))
+    tree = KinematicTree([1, 2, 3, 4, 9], 1, joints)
+    q = tree.observed()
+    assert q[1].tolist() == pytest.approx([0.3, 0.5, -0.4, 0.1, 0.2, 0.3, 1.0, 2, 3, 0.1, 0.2, 0.3])
+    T = forward_kinematics(tree, q, clamp=True)
+    assert torch.allclose(T[1, 4], torch.tensor(turn([0, 0, 0.1], np.zeros(3)) @ shift([0, 0, 0.3])))
+    assert torch.allclose(T[1, 2], torch.tensor(turn([0.1, 0.2, 0.3], np.zeros(3))))
+    assert torch.allclose(T[1, 3], se3_exp(q[1, -6:]))
+    by_name = forward_kinematics(tree, {"joint_1_3": [0.1, 0.2, 0.3]})
+    assert torch.allclose(by_name[2], T[1, 2]) and torch.equal(by_name[1], torch.eye(4).double())
+    assert torch.allclose(forward_kinematics(tree, 2 * q, clamp=True), T)

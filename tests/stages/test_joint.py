@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, inverse, se3_exp, se3_log
-from splatart_ns.stages.joint import fit_joint, fit_joints, joint_motion, surface_noise
+from splatart_ns.stages.joint import fit_joint, fit_joints, free_joint, joint_motion, surface_noise
 
 seeds = given(seed=st.integers(0, 2**31))
 
@@ -190,7 +190,7 @@ def test_half_a_turn():
     assert float(fit.values[1]) == pytest.approx(math.pi)
 
 
-def test_a_screw_needs_three_states_and_is_found_on_request():
+def test_a_screw_is_found_with_its_pitch():
     scene = Scene(14)
     types = ("fixed", "prismatic", "revolute", "screw")
     T = scene.motions("screw", [0.0, 1.0, -0.8, 2.5], pitch=0.1)
@@ -199,6 +199,47 @@ def test_a_screw_needs_three_states_and_is_found_on_request():
     assert torch.allclose(fit.motion(fit.values), T, atol=1e-9)
     plain = fit_joint(scene.motions("revolute", [0.0, 1.0, -0.8]), scene.points, object_radius=1.0, types=types)
     assert plain.type == "revolute"
+
+
+MANY_VALUES = {
+    "cylindrical": [[0.0, 0.0], [0.3, -0.9], [-0.1, 2.0], [0.2, 0.4]],
+    "spherical": [[0.0, 0.0, 0.0], [0.5, -0.2, 0.9], [-1.5, 0.3, 0.2], [0.1, 1.0, 2.0]],
+}
+
+
+@pytest.mark.parametrize("kind", MANY_VALUES)
+def test_exact_motions_give_the_exact_joint_of_more_freedom(kind):
+    scene = Scene(17)
+    T = scene.motions(kind, MANY_VALUES[kind])
+    fit = fit_joint(T, scene.points, object_radius=1.0)
+    assert fit.type == kind and fit.converged and fit.residual < 1e-12 and fit.limits is None
+    assert torch.allclose(fit.motion(fit.values), T, atol=1e-9)
+    assert fit.values.shape == (4, fit.dofs) and torch.all(fit.values[0] == 0)
+    assert torch.tensor(fit.covariance["values"]).shape == (4 * fit.dofs, 4 * fit.dofs)
+    if kind == "spherical":
+        assert torch.allclose(fit.origin, scene.origin, atol=1e-9)
+    else:
+        assert scene.axis_error(fit) < 1e-9 and scene.line_error(fit) < 1e-9
+
+
+@pytest.mark.parametrize("kind", MANY_VALUES)
+def test_reversing_a_joint_of_more_freedom(kind):
+    scene, other = Scene(18), Scene(19)
+    T = scene.motions(kind, MANY_VALUES[kind], noise=0.001)
+    for fit in (fit_joint(T, scene.points, object_radius=1.0), free_joint(T, scene.points)):
+        back = fit.reversed(other.points, inverse(T))
+        assert torch.allclose(back.motion(back.values), inverse(fit.motion(fit.values)), atol=1e-12)
+        assert back.residual < 0.02
+
+
+def test_noise_that_was_underestimated_does_not_buy_freedom():
+    scenes = [Scene(seed) for seed in range(40)]
+    T = torch.stack([scene.motions("revolute", [0.0, 0.7, -0.5, 1.2], noise=0.003) for scene in scenes])
+    fits = fit_joints(T, [scene.points for scene in scenes], 1.0, noise=0.001)
+    assert sum(fit.type == "revolute" for fit in fits) >= 32
+    assert sum(fit.chi2 for fit in fits) / 40 > 5 * 11  # 11 numbers are left over
+    loosest = [min(a["score"] for a in fit.alternatives) for fit in fits]
+    assert all(score > fit.score for score, fit in zip(loosest, fits, strict=True))
 
 
 def test_parts_of_two_points_or_one_are_fitted():

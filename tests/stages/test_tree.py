@@ -1,13 +1,23 @@
+import itertools
 import math
 
 import pytest
 import torch
 
-from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp, transform_points
+from splatart_ns.errors import InputError
+from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp, so3_exp, transform_points
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.contact import find_contacts
 from splatart_ns.stages.joint import JointFit
-from splatart_ns.stages.tree import choose_root, fit_pairs, infer_tree, object_radius
+from splatart_ns.stages.tree import (
+    JointConstraint,
+    cheapest_parents,
+    choose_root,
+    fit_pairs,
+    infer_tree,
+    object_radius,
+    parse_constraints,
+)
 
 Z, X, Y = (torch.tensor(v, dtype=torch.float64) for v in ((0, 0, 1.0), (1.0, 0, 0), (0, 1.0, 0)))
 
@@ -230,3 +240,158 @@ def test_rendering_ratios_and_covariances_reach_the_fits():
     loose = {p: torch.eye(6, dtype=torch.float64).repeat(2, 1, 1) for p in points}
     assert fit_pairs(points, motions, 1.0, covariances=loose)[1, 2].type == "fixed"
     assert set(find_contacts(points, motions)) == {(1, 2), (1, 3), (2, 3)}
+
+
+def test_a_part_that_stood_still_lends_its_joint_no_error():
+    """A blade turns about z and is known but for a slide along z; its parent stood still, whatever its covariance."""
+    generator = torch.Generator().manual_seed(0)
+    points = {p: torch.rand(200, 3, generator=generator, dtype=torch.float64) * 0.1 for p in (1, 2)}
+    turn = torch.tensor([0.0, 0.0, 0.8], dtype=torch.float64)
+    moved = from_rotation_translation(so3_exp(turn), torch.tensor([0.0, 0.0, 1e-3], dtype=torch.float64))
+    eye = torch.eye(4, dtype=torch.float64)
+    motions = {1: torch.stack([eye, eye]), 2: torch.stack([eye, moved])}
+    sigma = torch.tensor([1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4], dtype=torch.float64)
+    covariances = {p: (sigma**2).diag().repeat(2, 1, 1) for p in (1, 2)}
+    covariances[1] = 1e4 * covariances[1]
+    for pair in ((1, 2), (2, 1)):
+        axis = fit_pairs(points, motions, 1.0, covariances=covariances, noise=1e-5)[pair].axis
+        assert math.degrees(math.asin(float(torch.linalg.vector_norm(axis[:2])))) < 0.05
+
+
+def test_parts_that_hang_together_but_on_nothing_else_are_carried_by_a_free_joint():
+    """Scissors thrown across the room: how they open is not lost, and that no joint explains the throw is said."""
+    points, truth, q = drawers(4)
+    motions = motions_of(truth, q)
+    points |= {7: rod((0, 3, 0), (1, 3, 0), 0.1, 9), 8: rod((0, 3, 0), (-1, 3.2, 0), 0.1, 10)}
+    throws = torch.randn(3, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    motions[7] = torch.cat([torch.eye(4).double()[None], se3_exp(throws)])
+    hinge = true_joint(7, 8, "revolute", Z, (0, 3, 0)).fit.motion(torch.tensor([0.0, 0.4, -0.3, 0.8]).double())
+    motions[8] = motions[7] @ hinge
+    tree = infer_tree(points, motions, root=1)
+    (base,) = tree.unattached
+    other = {7: 8, 8: 7}[base]
+    assert edges(tree) == {(1, 2), (1, 3), (1, base), (base, other)}
+    assert {j.child: j.fit.type for j in tree.joints if j.child > 3} == {base: "free", other: "revolute"}
+    assert f"No joint explains how part {base} moves" in tree.unattached[base]
+    assert tree.observed().shape == (4, 1 + 1 + 6 + 1)
+    T = forward_kinematics(tree, tree.observed(), root_motion=motions[1])
+    for k, part in enumerate(tree.part_ids):
+        assert torch.allclose(T[:, k], motions[part], atol=1e-9)
+
+
+def test_two_hinges_in_a_row_are_not_one_ball_joint():
+    """A wrist of three concurrent axes: across two hinges the hand moves as about a ball, and the tree has hinges."""
+    points = {k: rod(*ends, 0.1, k) for k, ends in {1: ((-1, 0, 0), (0, 0, 0)), 3: ((0, 0, 0), (1, 0, 0))}.items()}
+    points[2] = box((0, 0, 0), (0.15, 0.15, 0.15), 2)
+    joints = [true_joint(1, 2, "revolute", Z, (0, 0, 0)), true_joint(2, 3, "revolute", Y, (0, 0, 0))]
+    q = torch.tensor([[0, 0], [0.5, 0.6], [-0.4, 0.9], [0.8, -0.5], [-0.6, -0.7]], dtype=torch.float64)
+    truth = KinematicTree([1, 2, 3], 1, joints)
+    motions = motions_of(truth, q)
+    assert fit_pairs(points, motions, 1.0)[1, 3].type == "spherical"
+    tree = infer_tree(points, motions, root=1)
+    assert edges(tree) == edges(truth) and {j.fit.type for j in tree.joints} == {"revolute"}
+    assert [(j.parent, j.child) for j in tree.rejected] == [(1, 3)] and not tree.loops
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_parents_cost_least_of_all_trees(seed):
+    generator = torch.Generator().manual_seed(seed)
+    costs = {
+        (a, b): float(torch.rand(1, generator=generator))
+        for a in range(5)
+        for b in range(5)
+        if a != b and torch.rand(1, generator=generator) < 0.7
+    }
+
+    def total(parents):
+        for part in range(1, 5):
+            for _ in range(5):
+                part = parents[part] if part else 0
+            if part:
+                return math.inf
+        return math.fsum(costs.get((a, b), math.inf) for b, a in parents.items())
+
+    every = [dict(zip(range(1, 5), choice, strict=True)) for choice in itertools.product(range(5), repeat=4)]
+    best = min(map(total, every))
+    parents = cheapest_parents(costs, 0)
+    if math.isfinite(best):
+        assert total(parents) == pytest.approx(best)
+    else:
+        assert len(parents) < 4
+
+
+NAMES = {1: "body", 2: "left", 3: "right"}
+
+
+def test_the_users_word_on_joints_is_read():
+    words = ["left:body=revolute", " right : left ", "right:body=none", "left:body=not-screw"]
+    assert parse_constraints(words, NAMES) == [
+        JointConstraint(1, 2, "revolute"),
+        JointConstraint(2, 3),
+        JointConstraint(1, 3, forbidden=True),
+        JointConstraint(1, 2, "screw", forbidden=True),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["left"], "has no ':'"),
+        (["left:door"], "called 'door'; there are body, left, right"),
+        (["left:body="], "names no type; there are fixed, prismatic"),
+        (["left:body=hinge"], "names no type"),
+        (["left:left"], "with itself"),
+        (["left:body", "left:right"], "two parents"),
+        (["left:body=revolute", "left:body=screw"], "two types"),
+        (["left:right", "right:left"], "circle"),
+        (["left:body", "left:body=none"], "both required and forbidden"),
+        (["left:body", "body:left=none"], "both required and forbidden"),
+        (["left:body=screw", "left:body=not-screw"], "both required and forbidden"),
+        (["body:left"], "hangs the root"),
+    ],
+)
+def test_constraints_that_cannot_be_met_say_why(words, message):
+    with pytest.raises(InputError, match=message):
+        parse_constraints(words, NAMES, root=1)
+
+
+def test_the_user_decides_what_hangs_on_what():
+    points, truth, q = drawers(4)
+    motions = motions_of(truth, q)
+    assert edges(infer_tree(points, motions)) == {(1, 2), (1, 3)}
+    tree = infer_tree(points, motions, constraints=[JointConstraint(2, 3)])
+    assert edges(tree) == {(1, 2), (2, 3)}
+    tree = infer_tree(points, motions, constraints=[JointConstraint(1, 3, forbidden=True)])
+    assert edges(tree) == {(1, 2), (2, 3)}
+    # The root that would be chosen is somebody's child now.
+    tree = infer_tree(points, motions, constraints=[JointConstraint(2, 1)])
+    assert tree.root != 1 and (2, 1) in edges(tree) and len(tree.joints) == 2
+    with pytest.raises(InputError, match="hangs the root"):
+        infer_tree(points, motions, root=1, constraints=[JointConstraint(2, 1)])
+    with pytest.raises(InputError, match="part 9"):
+        infer_tree(points, motions, constraints=[JointConstraint(1, 9)])
+
+
+@pytest.mark.parametrize("kind", ["fixed", "revolute", "screw", "cylindrical", "spherical", "free"])
+def test_the_user_decides_of_which_type_a_joint_is(kind):
+    points, truth, q = drawers(4)
+    tree = infer_tree(points, motions_of(truth, q), constraints=[JointConstraint(1, 3, kind)])
+    assert {j.child: j.fit.type for j in tree.joints} == {2: "prismatic", 3: kind} and not tree.unattached
+
+
+def test_a_type_can_be_excluded():
+    points, truth, q = drawers(4)
+    excluded = JointConstraint(1, 3, "prismatic", forbidden=True)
+    tree = infer_tree(points, motions_of(truth, q), constraints=[JointConstraint(1, 3), excluded])
+    (joint,) = (j for j in tree.joints if j.child == 3)
+    assert joint.parent == 1 and joint.fit.type == "cylindrical" and joint.fit.residual < 1e-3
+
+
+def test_a_required_joint_that_nothing_explains_is_free():
+    points, truth, q = drawers(4)
+    motions = motions_of(truth, q)
+    throws = torch.randn(3, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    motions[3] = torch.cat([torch.eye(4).double()[None], se3_exp(throws)])
+    assert list(infer_tree(points, motions).unattached) == [3]
+    tree = infer_tree(points, motions, constraints=[JointConstraint(1, 3)])
+    assert {j.child: j.fit.type for j in tree.joints} == {2: "prismatic", 3: "free"} and not tree.unattached
