@@ -49,9 +49,11 @@ def refine_poses(
             if pair is None:
                 covariances[s, p] = torch.nan
                 continue
+            equations = None
             if not frozen[s, p]:
-                T[s, p] = refine(pair, T[s, p], MAX_ITERATIONS).T
-            covariances[s, p] = motion_covariance(pair, T[s, p])
+                found = refine(pair, T[s, p], MAX_ITERATIONS)
+                T[s, p], equations = found.T, found.equations
+            covariances[s, p] = motion_covariance(pair, T[s, p], equations)
     return T, covariances
 
 

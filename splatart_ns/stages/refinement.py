@@ -25,6 +25,8 @@ class Refinement:
     """Mean Huber cost per own pixel."""
     converged: bool
     iterations: int
+    equations: NormalEquations
+    """At T, for `motion_covariance`."""
 
 
 def increment(T: Tensor, xi: Tensor, centroid: Tensor, radius: float) -> Tensor:
@@ -58,11 +60,11 @@ def refine(pair: PartPair, T: Tensor, max_iterations: int = 6, hold_rotation: bo
         else:
             damping = max(damping, 1e-3) * 10
             converged = damping > 1e2 or bool(step.abs().max() < 0.1 * STEP)
-    return Refinement(T, equations.cost, converged, iteration)
+    return Refinement(T, equations.cost, converged, iteration, equations)
 
 
 @dataclass(frozen=True)
-class _NormalEquations:
+class NormalEquations:
     """Of the Huber cost, in units of radii and radians."""
 
     H: Tensor
@@ -73,7 +75,7 @@ class _NormalEquations:
 
 
 @torch.no_grad()
-def _normal_equations(pair: PartPair, T: Tensor, n: int) -> _NormalEquations:
+def _normal_equations(pair: PartPair, T: Tensor, n: int) -> NormalEquations:
     steps = torch.nn.functional.pad(STEP * torch.eye(n, dtype=T.dtype, device=T.device), (0, 6 - n, 1, 0))
     motions = increment(T.expand(n + 1, 4, 4), steps, pair.centroid, pair.radius)
     H = torch.zeros(n, n, dtype=T.dtype, device=T.device)
@@ -87,11 +89,11 @@ def _normal_equations(pair: PartPair, T: Tensor, n: int) -> _NormalEquations:
         H += (wJ @ J.T).double()
         gradients.append((wJ @ r).double())
         cost += float((w * huber(r)).sum())
-    return _NormalEquations(H, torch.stack(gradients), cost / max(pair.area, 1.0))
+    return NormalEquations(H, torch.stack(gradients), cost / max(pair.area, 1.0))
 
 
-def motion_covariance(pair: PartPair, T: Tensor) -> Tensor:
-    """How uncertain a refined motion T [4, 4] is [6, 6] float64.
+def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | None = None) -> Tensor:
+    """How uncertain a refined motion T [4, 4] is [6, 6] float64; `equations`: those of its `Refinement`, if it has one.
 
     The tangent is (translation, rotation) of a left increment in the world frame: T = se3_exp(xi) T_true, so that the
     translation is that of the world's origin. A sandwich estimate with views as clusters (Liang and Zeger 1986):
@@ -101,7 +103,7 @@ def motion_covariance(pair: PartPair, T: Tensor) -> Tensor:
     what no image shows, like the turn of a plain round part about its axis.
     """
     T = T.double()
-    equations = _normal_equations(pair, T, 6)
+    equations = equations or _normal_equations(pair, T, 6)
     # Mean squared residual of one of the 4 channels; a perfect fit has none.
     variance = max(equations.cost / 2, 1e-9)
     V = len(equations.g)

@@ -70,10 +70,14 @@ def initial_motion(
     identity = torch.eye(4, dtype=torch.float64, device=splats[0].means.device)
     if min(len(source.xyz), len(target.xyz)) < MIN_POINTS:
         return InitialMotion(identity, found=False)
-    found = register(source, target, seed).T
-    candidates = torch.from_numpy(np.concatenate([found, point_to_plane(source, target, found)])).to(identity)
     coarse = part_pair(splats, views, part, VIEWS, COARSE_PIXELS)
     fine = part_pair(splats, views, part, VIEWS, FINE_PIXELS)
+    if fine is not None:
+        own_cost, identity_cost = fine.own_cost(), float(fine.cost(identity[None])[0])
+        if identity_cost < STILL_RATIO * own_cost:  # no motion fits much better than a state's own Gaussians
+            return InitialMotion(identity, found=True, still=True, cost=identity_cost, identity_ratio=1.0)
+    found = register(source, target, seed).T
+    candidates = torch.from_numpy(np.concatenate([found, point_to_plane(source, target, found)])).to(identity)
     if coarse is None or fine is None:
         return InitialMotion(candidates[0], found=True)
     everything = torch.cat([identity[None], candidates])
@@ -83,14 +87,14 @@ def initial_motion(
     if len(candidates) > 1:
         candidates = choose(coarse, torch.stack([refine(coarse, T, 5).T for T in candidates]), 1.5)
     ends = [refine(fine, T, 10) for T in candidates]
-    if min(e.cost for e in ends) > SUSPECT * fine.own_cost():
+    if min(e.cost for e in ends) > SUSPECT * own_cost:
         tiny = part_pair(splats, views, part, 3, TINY_PIXELS)
         wide = torch.stack([search(tiny, T) for T in choose(coarse, everything, float("inf"), keep=5)])
         ends += [refine(fine, T, 10) for T in choose(coarse, wide, 1.5)]
     cost = np.array([e.cost for e in ends])
     order = distinct(torch.stack([e.T for e in ends]).cpu().numpy(), cost, source.centroid, source.radius)
     best = ends[order[0]]
-    identity_ratio = float(fine.cost(identity[None])[0]) / max(best.cost, 1e-12)
+    identity_ratio = identity_cost / max(best.cost, 1e-12)
     still = identity_ratio < STILL_RATIO
     return InitialMotion(
         identity if still else best.T,
