@@ -10,6 +10,7 @@ from typing import Literal
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
@@ -235,7 +236,7 @@ class PosePipeline(VanillaPipeline):
         return splat.select(unmixed(splat))
 
     def get_training_callbacks(self, training_callback_attributes) -> list[TrainingCallback]:
-        optimizers = training_callback_attributes.optimizers.optimizers
+        optimizers = training_callback_attributes.optimizers
         steps = training_callback_attributes.trainer.config.max_num_iterations
         if steps <= self.model.config.pose_steps:
             raise InputError(
@@ -254,7 +255,7 @@ class PosePipeline(VanillaPipeline):
         return [TrainingCallback(before, merge), TrainingCallback(before, count)]
 
     @torch.no_grad()
-    def _merge(self, optimizers: dict[str, torch.optim.Optimizer]) -> None:
+    def _merge(self, optimizers: Optimizers) -> None:
         """End the search for poses, then keep one set of Gaussians, in the canonical frame."""
         model = self.model
         splats = [model.state_splat(s).detach() for s in range(model.num_states)]
@@ -266,8 +267,9 @@ class PosePipeline(VanillaPipeline):
         params = gauss_params_from_splat(merged)
         for name, parameter in params.items():
             model.gauss_params[name] = parameter
-            optimizers[name].param_groups[0]["params"] = [parameter]
-            optimizers[name].state.clear()
+            optimizers.optimizers[name].param_groups[0]["params"] = [parameter]
+            optimizers.optimizers[name].state.clear()
+        optimizers.schedulers.pop("part_poses", None)  # they are final
         model.state_ids = torch.zeros(len(merged), dtype=torch.long, device=model.device)
         model.merged = torch.tensor(True, device=model.device)
 

@@ -39,7 +39,7 @@ from splatart_ns.stages.joint_descent import descend_joint
 from splatart_ns.stages.tree_refinement import refine_tree
 
 JointMethod = Literal["screw", "descent"]
-_SEEN_NOISE = 0.1
+_SEEN_NOISE = 0.3
 """Share of the noise that is left where the covariances of the motions are known. Measured on random objects: with 0.03
 only 89 % of the true lines lie in their 95 % regions."""
 _STACKED = 0.02
