@@ -319,18 +319,19 @@ def _fit(kind: str, T: Tensor, whiten: Tensor, unseen: Tensor, points: list[Tens
     Their covariances are tensors still. `unseen` [B, n, 6, 6] takes from a small motion what nothing shows. Along it
     the motions may be anywhere, far beyond where a covariance means something: they are put where the joint has them.
     """
-    joints, iterations, converged = _descended(kind, _closed_form(kind, T), T, whiten)
+    levers = torch.stack([x.square().sum(-1).mean().sqrt() for x in points]).clamp_min(1e-9)
+    joints, iterations, converged = _descended(kind, _closed_form(kind, T), T, whiten, levers)
     if unseen.any():
         back = se3_exp(-(unseen @ se3_log(inverse(model_motions(kind, joints)) @ T)[..., None])[..., 0])
         T, whiten = T @ back, whiten @ adjoint(back)
-        joints, more, converged = _descended(kind, joints, T, whiten)
+        joints, more, converged = _descended(kind, joints, T, whiten, levers)
         iterations = iterations + more
     cost = _residuals(kind, joints, T, whiten).square().sum(-1)
     return _results(kind, joints, T, whiten, points, cost, iterations, converged)
 
 
-def _descended(kind: str, joints: Joints, T: Tensor, whiten: Tensor) -> tuple[Joints, Tensor, Tensor]:
-    """Joints of least cost from a start by Levenberg-Marquardt, iterations [B], and whether they converged [B]."""
+def _descended(kind: str, joints: Joints, T: Tensor, whiten: Tensor, levers: Tensor) -> tuple[Joints, Tensor, Tensor]:
+    """Joints of least cost by Levenberg-Marquardt, its iterations [B], and whether they converged [B]."""
     joints = tuple(a.clone() for a in joints)
     r = _residuals(kind, joints, T, whiten)
     cost, damping = (r * r).sum(-1), torch.full_like(T[:, 0, 0, 0], 1e-6)
@@ -345,7 +346,7 @@ def _descended(kind: str, joints: Joints, T: Tensor, whiten: Tensor) -> tuple[Jo
         now, T_now, whiten_now = tuple(a[open_] for a in joints), T[open_], whiten[open_]
         H, g, scale = normal_equations(_jacobian(kind, now, T_now, whiten_now), r[open_])
         step = torch.linalg.solve(H + damping[open_, None, None] * torch.eye(H.shape[-1]).to(H), -g) / scale
-        trial = moved(kind, now, step)
+        trial = moved(kind, now, step, levers[open_])
         r_trial = _residuals(kind, trial, T_now, whiten_now)
         trial_cost = (r_trial * r_trial).sum(-1)
         better, gain = trial_cost <= cost[open_], cost[open_] - trial_cost

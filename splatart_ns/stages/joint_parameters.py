@@ -99,20 +99,34 @@ def _value_twists(kind: str, joints: Joints) -> Tensor:
     return torch.stack(twists, -1)[:, None].expand(-1, values.shape[1], -1, -1)
 
 
-def moved(kind: str, joints: Joints, step: Tensor) -> Joints:
+def moved(kind: str, joints: Joints, step: Tensor, levers: Tensor | None = None) -> Joints:
+    """The joints after a step of the parameters of `body_twists`.
+
+    The axis turns about the centroid. With `levers` [B], lengths of the size of the children, an axis that is shifted
+    away turns its child less, for the same travel at the lever: of a far axis the travel is known and the turn is not,
+    so that steps of both at once would leave the valley that they are to follow.
+    """
     axis, point, pitch, values = joints
-    values = values + step[:, -values[0].numel() :].reshape(values.shape)
+    steps = step[:, -values[0].numel() :].reshape(values.shape)
     if kind == "spherical":
-        return axis, point + step[:, :3], pitch, values
+        return axis, point + step[:, :3], pitch, values + steps
     columns = across(axis)
-    turned = (so3_exp((columns @ step[:, :2, None])[..., 0]) @ axis[..., None])[..., 0]
-    turned = turned / torch.linalg.vector_norm(turned, dim=-1, keepdim=True)
+    R = so3_exp((columns @ step[:, :2, None])[..., 0])
     if kind != "prismatic":
-        point = point + (columns @ step[:, 2:4, None])[..., 0]
-        point = point - (point * turned).sum(-1, keepdim=True) * turned
+        shift = (columns @ step[:, 2:4, None])[..., 0]
+        if levers is not None:
+            arm, new_arm = ((x.square().sum(-1) + levers**2).sqrt()[:, None] for x in (point, point + shift))
+            longer = (point * shift).sum(-1, keepdim=True) / arm
+            turn = values[..., -1]
+            kept = ((turn + steps[..., -1]) * arm + turn * longer) / new_arm - turn
+            steps = torch.cat([steps[..., :-1], kept[..., None]], -1)
+        point = (R @ (point + shift)[..., None])[..., 0]
+    axis = (R @ axis[..., None])[..., 0]
+    axis = axis / torch.linalg.vector_norm(axis, dim=-1, keepdim=True)
+    point = point - (point * axis).sum(-1, keepdim=True) * axis
     if kind == "screw":
         pitch = pitch + step[:, 4]
-    return turned, point, pitch, values
+    return axis, point, pitch, values + steps
 
 
 def covariance_blocks(kind: str, axis: Tensor, values: Tensor, C: Tensor) -> dict[str, Tensor]:

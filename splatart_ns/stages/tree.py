@@ -202,9 +202,9 @@ def _told(
 ) -> dict[tuple[int, int], JointFit]:
     """The joints, both ways round, of a pair of parts as the user wants them; `settings` as in `fit_pairs`."""
     kind, pair = constraint.type, (constraint.parent, constraint.child)
-    fits = {edge: joints[edge] for edge in (pair, pair[::-1])}
+    fits = {edge: joints[edge] for edge in (pair, pair[::-1]) if edge in joints}
     if constraint.forbidden:
-        if kind is None:
+        if kind is None or not fits:
             return {}
         types = [t for t in types_for(len(motions[pair[0]])) if t != kind]
         return fit_pairs(points, motions, object_radius, types=types, **settings) if fits[pair].type == kind else fits

@@ -361,7 +361,8 @@ def test_the_user_decides_what_hangs_on_what():
     assert edges(infer_tree(points, motions)) == {(1, 2), (1, 3)}
     tree = infer_tree(points, motions, constraints=[JointConstraint(2, 3)])
     assert edges(tree) == {(1, 2), (2, 3)}
-    tree = infer_tree(points, motions, constraints=[JointConstraint(1, 3, forbidden=True)])
+    excluded = [JointConstraint(1, 3, forbidden=True), JointConstraint(1, 3, "screw", forbidden=True)]
+    tree = infer_tree(points, motions, constraints=excluded)
     assert edges(tree) == {(1, 2), (2, 3)}
     # The root that would be chosen is somebody's child now.
     tree = infer_tree(points, motions, constraints=[JointConstraint(2, 1)])
