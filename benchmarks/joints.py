@@ -25,6 +25,7 @@ from rich.table import Table
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "stages"))
 from joint_cases import HARD_CASES, TREE_CASES, JointErrors, fit_cases, joint_errors, random_case, random_object
 
+from splatart_ns.evaluation.joints import axis_angle
 from splatart_ns.stages.joint import types_for
 from splatart_ns.stages.tree import descend_pairs, fit_pairs, infer_tree, object_radius
 
@@ -121,13 +122,15 @@ def against_descent() -> Iterable[list[str]]:
         seconds = middle - start, time.process_time() - middle
         edges = [(j.parent, j.child) for j in case.truth.joints if ours[j.parent, j.child].type == j.fit.type]
         edges = [edge for edge in edges if theirs[edge].type == ours[edge].type]
+        axes = {(j.parent, j.child): j.fit.axis for j in case.truth.joints}
         residuals = [[fits[edge].residual / radius for edge in edges] for fits in (ours, theirs)]
+        errors = [[axis_angle(fits[edge].axis, axes[edge]) for edge in edges] for fits in (ours, theirs)]
         yield [
             f"{noise:g}",
             f"{seconds[0]:.3f}",
             f"{seconds[1]:.1f}",
             f"{seconds[1] / seconds[0]:.0f}",
-            *(f"{statistics.mean(of):.4g}" for of in residuals),
+            *(f"{statistics.mean(of):.2g}" for of in (*residuals, *errors)),
             f"{len(edges)} of 4",
         ]
 
@@ -153,7 +156,7 @@ def main() -> None:
     show("Joint stage, growth", columns, [row for states in (2, 5, 10) for row in growth(states)])
     show(
         "10 pairs at 2 states, against the paper's gradient descent (3,000 steps a type)",
-        ("noise, R", "s", "s of descent", "times faster", "residual, R", "of descent, R", "true joints compared"),
+        ("noise, R", "s", "descent, s", "times faster", "residual, R", "descent", "axis, deg", "descent", "joints"),
         against_descent(),
     )
 
