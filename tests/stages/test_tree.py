@@ -7,10 +7,11 @@ import torch
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp, so3_exp, transform_points
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
-from splatart_ns.stages.contact import find_contacts
+from splatart_ns.stages.contact import Contact, find_contacts
 from splatart_ns.stages.joint import JointFit
 from splatart_ns.stages.tree import (
     JointConstraint,
+    build_tree,
     cheapest_parents,
     choose_root,
     fit_pairs,
@@ -396,3 +397,18 @@ def test_a_required_joint_that_nothing_explains_is_free():
     assert list(infer_tree(points, motions).unattached) == [3]
     tree = infer_tree(points, motions, constraints=[JointConstraint(1, 3)])
     assert {j.child: j.fit.type for j in tree.joints} == {2: "prismatic", 3: "free"} and not tree.unattached
+
+
+@pytest.mark.parametrize("closer, parent", [(0.01, 1), (0.05, 2)])
+def test_between_nearly_equal_parents_the_root_wins(closer, parent):
+    """Part 3 slides against the root and against part 2, and is by `closer` radii nearer to part 2."""
+
+    def slide(values):
+        return JointFit("prismatic", X, torch.zeros(3).double(), 0.0, torch.tensor(values).double(), residual=0.0)
+
+    joints = {(1, 2): slide([0.0, 0.2]), (1, 3): slide([0.0, 0.3]), (2, 3): slide([0.0, 0.1])}
+    joints |= {(b, a): fit for (a, b), fit in joints.items()}
+    gaps = {(1, 2): 0.02, (1, 3): 0.06, (2, 3): 0.06 - closer}
+    contacts = {pair: Contact(gap, torch.zeros(1, 3).double()) for pair, gap in gaps.items()}
+    tree = build_tree([1, 2, 3], joints, contacts, 1, 1.0)
+    assert {j.child: j.parent for j in tree.joints} == {2: 1, 3: parent}
