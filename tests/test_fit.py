@@ -161,7 +161,7 @@ class TestResuming:
         from splatart_ns.plugin.fit import Report, Settings
 
         def make(bundle, capture, quality="draft", root=None, seed=0, rasterizer="auto", joints=()):
-            settings = Settings(quality, root, seed, rasterizer, joints)
+            settings = Settings(quality, root, seed, rasterizer, list(joints))
             return Report(bundle / "report.json", load_capture(capture), settings)
 
         return make

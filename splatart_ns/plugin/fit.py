@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -33,7 +33,7 @@ from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.method_configs.semantic import method as semantic_method
 from splatart_ns.plugin.compat import seed_everything
 from splatart_ns.rasterize.rasterization import Backend, default_backend, set_backend
-from splatart_ns.stages.tree import parse_constraints
+from splatart_ns.stages.joint_constraint import parse_constraints
 
 Quality = Literal["draft", "standard", "high"]
 
@@ -65,7 +65,7 @@ class Settings:
     root: str | None
     seed: int
     rasterizer: Backend = "auto"
-    joints: tuple[str, ...] = ()
+    joints: list[str] = field(default_factory=list)
 
 
 class Report:
@@ -76,7 +76,7 @@ class Report:
         self.data: dict[str, Any] = {
             "capture": str(capture.path.absolute()),
             "capture_sha256": _digest(capture),
-            "settings": asdict(settings) | {"joints": list(settings.joints)},
+            "settings": asdict(settings),
             "seed": settings.seed,
             "device": "cuda: " + torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
             "rasterizer": default_backend(),
@@ -166,7 +166,7 @@ def fit(
     if not 0 <= seed < 2**32:
         raise InputError(f"--seed is {seed}; give 0 to {2**32 - 1}.")
     output_dir = output_dir.absolute()
-    settings = Settings(quality, root, seed, rasterizer, joints)
+    settings = Settings(quality, root, seed, rasterizer, list(joints))
     report = Report(output_dir / "report.json", capture, settings)
     try:
         (output_dir / "runs").mkdir(parents=True, exist_ok=True)
@@ -217,9 +217,9 @@ def _joint_config(capture: Capture, pose_run: Path, bundle: Path, settings: Sett
     config.bundle_dir = bundle
     config.pipeline.pose_run = pose_run
     config.pipeline.root = settings.root
-    config.pipeline.joints = settings.joints
+    config.pipeline.joints = tuple(settings.joints)
     config.pipeline.seed = settings.seed
-    config.pipeline.settings = asdict(settings) | {"joints": list(settings.joints)}
+    config.pipeline.settings = asdict(settings)
     return _with_data(config, capture, 0, settings.seed)
 
 

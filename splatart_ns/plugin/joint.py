@@ -28,10 +28,11 @@ from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.joint import JOINT_DOFS, JointFit
+from splatart_ns.stages.joint_constraint import parse_constraints
 from splatart_ns.stages.pose import carry
-from splatart_ns.stages.tree import EPSILON, JointMethod, infer_tree, parse_constraints
+from splatart_ns.stages.tree import EPSILON, JointMethod, infer_tree
 
-JOINT_TYPES = ("revolute", "prismatic", "screw", "fixed", "cylindrical", "spherical", "free")
+JOINT_TYPES = tuple(JOINT_DOFS)
 MIN_POINT_OPACITY = 0.3
 """Fainter Gaussians say little of where a part's surface is."""
 

@@ -44,6 +44,7 @@ def joint_motion(kind: str, axis: Tensor, origin: Tensor, pitch: float | Tensor,
 
 
 def model_motions(kind: str, joints: Joints) -> Tensor:
+    """Motions [B, n, 4, 4] of the children at the states 1 and up."""
     axis, point, pitch, values = joints
     return joint_motion(kind, axis[:, None], point[:, None], pitch[:, None], values_of(kind, values))
 

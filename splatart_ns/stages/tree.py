@@ -13,8 +13,8 @@ the group, so that the joints within it are not lost.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
@@ -22,11 +22,11 @@ from torch import Tensor
 
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import adjoint, inverse, transform_points
+from splatart_ns.stages.arborescence import cheapest_parents, reached_from
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.contact import Contact, find_contacts
 from splatart_ns.stages.joint import (
     EPSILON,
-    JOINT_DOFS,
     NOISE,
     JointFit,
     fit_joint,
@@ -35,6 +35,7 @@ from splatart_ns.stages.joint import (
     surface_noise,
     types_for,
 )
+from splatart_ns.stages.joint_constraint import JointConstraint, required_parents
 from splatart_ns.stages.joint_descent import descend_joint
 from splatart_ns.stages.tree_refinement import refine_tree
 
@@ -47,82 +48,6 @@ _STACKED = 0.02
 body both."""
 _IN_TOUCH = 0.1
 """Largest gap of two parts of a group that only a free joint carries, as a share of the object's radius."""
-
-
-@dataclass(frozen=True)
-class JointConstraint:
-    """What the user says about the joint between two parts, given by their ids."""
-
-    parent: int
-    child: int
-    type: str | None = None
-    """A key of `JOINT_DOFS`; None for any."""
-    forbidden: bool = False
-    """There is no such joint, either way round; with a type, none of this type. Otherwise the joint is in the tree."""
-
-
-def parse_constraints(
-    words: Sequence[str], part_names: Mapping[int, str], root: int | None = None
-) -> list[JointConstraint]:
-    """Constraints from texts: `child:parent=revolute`, `child:parent` (of any type), `child:parent=none` (no joint),
-    `child:parent=not-revolute` (none of that type).
-
-    Raises:
-        InputError: a text of another form, a name that no part has, a type that there is not, contradictions.
-    """
-    ids = {name: part for part, name in part_names.items()}
-    constraints = []
-    for word in words:
-        pair, equals, kind = (text.strip() for text in word.partition("="))
-        child, colon, parent = (text.strip() for text in pair.partition(":"))
-        if not colon:
-            raise InputError(
-                f"--joint: '{word}' has no ':'; write child:parent=type, child:parent or child:parent=none"
-            )
-        for name in (child, parent):
-            if name not in ids:
-                raise InputError(f"--joint: no part is called '{name}'; there are {', '.join(ids)}")
-        forbidden = kind == "none" or kind.startswith("not-")
-        named = kind.removeprefix("not-")
-        if equals and kind != "none" and named not in JOINT_DOFS:
-            raise InputError(f"--joint: '{word}' names no type; there are {', '.join(JOINT_DOFS)} and none")
-        constraints.append(JointConstraint(ids[parent], ids[child], named if named in JOINT_DOFS else None, forbidden))
-    _check_constraints(constraints, root, part_names)
-    return constraints
-
-
-def _check_constraints(
-    constraints: Sequence[JointConstraint], root: int | None, part_names: Mapping[int, str]
-) -> dict[int, int]:
-    """The required parent by child. Raises InputError where no tree can be as the constraints say."""
-
-    def shown(c: JointConstraint) -> str:
-        return f"{part_names[c.child]}:{part_names[c.parent]}"
-
-    required: dict[int, JointConstraint] = {}
-    for c in constraints:
-        if c.parent == c.child:
-            raise InputError(f"--joint: '{shown(c)}' joins a part with itself; name two parts")
-        if c.forbidden:
-            continue
-        if c.child == root:
-            raise InputError(
-                f"--joint: '{shown(c)}' hangs the root on another part; choose another root or turn it round"
-            )
-        other = required.setdefault(c.child, c)
-        if other.parent != c.parent:
-            raise InputError(f"--joint: '{shown(other)}' and '{shown(c)}' give one part two parents; keep one of them")
-        if other.type != c.type:
-            raise InputError(f"--joint: '{shown(c)}' is given two types; keep one of them")
-    for c in constraints:
-        wanted = next((r for r in required.values() if _pair(c.parent, c.child) == _pair(r.parent, r.child)), None)
-        if c.forbidden and wanted is not None and c.type in (None, wanted.type):
-            raise InputError(f"--joint: '{shown(c)}' is both required and forbidden; keep one of them")
-    parents = {child: c.parent for child, c in required.items()}
-    if cycle := _find_cycle(parents):
-        around = " and ".join(f"'{shown(required[p])}'" for p in sorted(cycle))
-        raise InputError(f"--joint: {around} go round in a circle; leave one out")
-    return parents
 
 
 def object_radius(points: dict[int, Tensor]) -> float:
@@ -158,7 +83,7 @@ def infer_tree(
     """
     if missing := {p for c in constraints for p in (c.parent, c.child)} - set(points):
         raise InputError(f"--joint: part {min(missing)} has no Gaussians to hang; leave it out")
-    required = _check_constraints(constraints, root, {p: f"part {p}" for p in points})
+    required = required_parents(constraints, root, {p: f"part {p}" for p in points})
     radius = object_radius(points)
     if method == "descent":
         joints = descend_pairs(points, motions, radius, epsilon)
@@ -346,56 +271,6 @@ def build_tree(
     return replace(tree, loops=loops, rejected=rejected, unattached=unattached)
 
 
-def cheapest_parents(costs: Mapping[tuple[int, int], float], root: int) -> dict[int, int]:
-    """Parents by child in the arborescence of least total cost over what `root` reaches, costs by (parent, child).
-
-    Chu and Liu 1965, Edmonds 1967: everyone takes the cheapest parent; a circle becomes one node, and whoever enters
-    it pays for what is then given up.
-    """
-    reached = _reached(costs, root)
-    costs = {(a, b): cost for (a, b), cost in costs.items() if a in reached and b != root}
-    parents: dict[int, int] = {}
-    for (a, b), cost in costs.items():
-        if b not in parents or cost < costs[parents[b], b]:
-            parents[b] = a
-    circle = _find_cycle(parents)
-    if not circle:
-        return parents
-    node = max(reached) + 1
-    contracted: dict[tuple[int, int], float] = {}
-    original: dict[tuple[int, int], tuple[int, int]] = {}
-    for (a, b), cost in costs.items():
-        if a in circle and b in circle:
-            continue
-        edge = node if a in circle else a, node if b in circle else b
-        more = cost - costs[parents[b], b] if b in circle else cost
-        if edge not in contracted or more < contracted[edge]:
-            contracted[edge], original[edge] = more, (a, b)
-    outer = [original[a, b] for b, a in cheapest_parents(contracted, root).items()]
-    return {b: parents[b] for b in circle} | {b: a for a, b in outer}
-
-
-def _find_cycle(parents: Mapping[int, int]) -> set[int]:
-    """The parts of one circle of parents; empty if there is none."""
-    for part in parents:
-        path: list[int] = []
-        while part in parents and part not in path:
-            path.append(part)
-            part = parents[part]
-        if part in path:
-            return set(path[path.index(part) :])
-    return set()
-
-
-def _reached(edges: Collection[tuple[int, int]], start: int) -> set[int]:
-    """Where edges (from, to) lead, `start` included."""
-    reached, following = set(), {start}
-    while following:
-        reached |= following
-        following = {b for a, b in edges if a in following} - reached
-    return reached
-
-
 def _free_groups(
     points: dict[int, Tensor],
     motions: dict[int, Tensor],
@@ -407,12 +282,12 @@ def _free_groups(
 ) -> dict[tuple[int, int], JointFit]:
     """Free joints by (root, base) for groups of parts that touch and are joined, but by no joint to the rest."""
     edges = [edge for edge, fit in joints.items() if fit.accepted]
-    left = set(points) - _reached(edges, root)
+    left = set(points) - reached_from(edges, root)
     touching = [edge for edge in edges if contacts[_pair(*edge)].gap <= _IN_TOUCH * object_radius]
     touching += [edge for b, a in required.items() for edge in ((a, b), (b, a))]
     groups = {}
     while left:
-        group = _reached(touching, min(left))
+        group = reached_from(touching, min(left))
         left -= group
         if len(group) > 1:
             base = choose_root({p: points[p] for p in group if p not in required}, motions, object_radius)

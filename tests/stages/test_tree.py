@@ -6,18 +6,17 @@ import torch
 
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp, so3_exp, transform_points
+from splatart_ns.stages.arborescence import cheapest_parents
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.contact import Contact, find_contacts
 from splatart_ns.stages.joint import JointFit
+from splatart_ns.stages.joint_constraint import JointConstraint, parse_constraints
 from splatart_ns.stages.tree import (
-    JointConstraint,
     build_tree,
-    cheapest_parents,
     choose_root,
     fit_pairs,
     infer_tree,
     object_radius,
-    parse_constraints,
 )
 
 Z, X, Y = (torch.tensor(v, dtype=torch.float64) for v in ((0, 0, 1.0), (1.0, 0, 0), (0, 1.0, 0)))
