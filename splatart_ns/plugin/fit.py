@@ -1,4 +1,4 @@
-"""All stages in one process, resumable: `splatart fit`."""
+"""All stages, resumable: `splatart fit`."""
 
 from __future__ import annotations
 
@@ -6,20 +6,18 @@ import copy
 import hashlib
 import json
 import platform
-import resource
 import shutil
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
@@ -31,7 +29,7 @@ from splatart_ns.files import write_json
 from splatart_ns.method_configs.joint import method as joint_method
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.method_configs.semantic import method as semantic_method
-from splatart_ns.plugin.compat import seed_everything
+from splatart_ns.plugin.stage_run import Outcome, num_processes, run_side_by_side, run_stage
 from splatart_ns.rasterize.rasterization import Backend, default_backend, set_backend
 from splatart_ns.stages.joint_constraint import parse_constraints
 
@@ -69,7 +67,10 @@ class Settings:
 
 
 class Report:
-    """report.json: which stages have finished, and what they took. Written before and after each stage."""
+    """report.json: which stages have finished, and what they took. Written before and after each stage.
+
+    A stage's `seconds` are its own, its `wall_seconds` what it added to the whole: less for states fitted side by side.
+    """
 
     def __init__(self, path: Path, capture: Capture, settings: Settings):
         self.path = path
@@ -87,13 +88,15 @@ class Report:
             "seconds": 0.0,
         }
         self._earlier = self._read_stages() if path.exists() else []
+        self._last = time.perf_counter()
 
     def _read_stages(self) -> list[dict[str, Any]]:
         """What an earlier run has finished, when it was of the same capture and settings."""
         try:
             earlier = json.loads(self.path.read_text())
             stages = [
-                {**entry, "name": str(entry["name"]), "seconds": entry["seconds"] + 0.0} for entry in earlier["stages"]
+                {**entry, "name": str(entry["name"]), "wall_seconds": entry["wall_seconds"] + 0.0}
+                for entry in earlier["stages"]
             ]
             had, wanted = earlier["settings"], self.data["settings"]
             same = all(earlier.get(key) == self.data[key] for key in ("capture", "capture_sha256"))
@@ -115,18 +118,21 @@ class Report:
         """Whether a stage needs no work: it and all before it were finished, and its files are still `whole`."""
         if whole and self._earlier and self._earlier[0]["name"] == stage:
             self.data["stages"].append(self._earlier.pop(0))
+            self._last = time.perf_counter()
             return True
         self._earlier.clear()
         self._write()  # before the stage's files change, lest a killed run leaves them with another run's report
         return False
 
-    def add(self, **entry: Any) -> None:
+    def add(self, stage: str, outcome: Outcome) -> None:
         """Note a finished stage."""
-        self.data["stages"].append(entry)
+        now = time.perf_counter()
+        self.data["stages"].append({"name": stage, "wall_seconds": round(now - self._last, 2), **outcome})
+        self._last = now
         self._write()
 
     def _write(self) -> None:
-        self.data["seconds"] = round(sum(entry["seconds"] for entry in self.data["stages"]), 2)
+        self.data["seconds"] = round(sum(entry["wall_seconds"] for entry in self.data["stages"]), 2)
         write_json(self.path, self.data)
 
 
@@ -176,21 +182,20 @@ def fit(
     except OSError as error:
         raise InputError(f"{output_dir} cannot be written ({error.strerror}); choose another --output-dir.") from None
 
-    effort = EFFORTS[quality]
-    semantic_runs = []
+    runs = output_dir / "runs"
+    semantic = [_semantic_config(capture, index, runs, settings) for index in range(len(capture.states))]
+    pose = _pose_config(capture, [_config_file(config) for config in semantic], runs, settings)
+    joint = _joint_config(capture, _config_file(pose), runs, settings)
     with _progress() as progress:
-        for index, state in enumerate(capture.states):
-            config = _semantic_config(capture, index, effort, seed)
-            semantic_runs.append(_run(f"semantic {state.name}", config, output_dir, state.name, report, progress))
-        config = _pose_config(capture, semantic_runs, effort, seed)
-        pose_run = _run("pose", config, output_dir, "all", report, progress)
-        config = _joint_config(capture, pose_run, output_dir, settings)
-        _run("joint", config, output_dir, "all", report, progress, whole=_is_whole(output_dir))
+        _train({f"semantic {c.experiment_name}": c for c in semantic}, rasterizer, report, progress)
+        _train({"pose": pose}, rasterizer, report, progress)
+        _train({"joint": joint}, rasterizer, report, progress, whole=_is_whole(output_dir))
     return output_dir
 
 
-def _semantic_config(capture: Capture, state: int, effort: Effort, seed: int) -> TrainerConfig:
+def _semantic_config(capture: Capture, state: int, runs: Path, settings: Settings) -> TrainerConfig:
     config = copy.deepcopy(semantic_method.config)
+    effort = EFFORTS[settings.quality]
     part_steps = config.max_num_iterations - config.pipeline.model.semantic_start
     config.max_num_iterations = effort.steps + part_steps
     config.pipeline.model.semantic_start = effort.steps
@@ -200,27 +205,51 @@ def _semantic_config(capture: Capture, state: int, effort: Effort, seed: int) ->
         if optimizer["scheduler"] is not None:
             optimizer["scheduler"].max_steps = effort.steps
     config.pipeline.datamanager.seed_gaussians = effort.gaussians
-    config.pipeline.datamanager.seed = seed
-    return _with_data(config, capture, state, seed)
+    config.pipeline.datamanager.seed = settings.seed
+    return _placed(config, capture, state, runs, capture.states[state].name, settings.seed)
 
 
-def _pose_config(capture: Capture, semantic_runs: list[Path], effort: Effort, seed: int) -> TrainerConfig:
+def _pose_config(capture: Capture, semantic_runs: list[Path], runs: Path, settings: Settings) -> TrainerConfig:
     config = copy.deepcopy(pose_method.config)
     config.pipeline.semantic_runs = tuple(semantic_runs)
-    config.pipeline.seed = seed
-    config.max_num_iterations = config.pipeline.model.pose_steps + effort.merge_steps
-    return _with_data(config, capture, 0, seed)
+    config.pipeline.seed = settings.seed
+    config.max_num_iterations = config.pipeline.model.pose_steps + EFFORTS[settings.quality].merge_steps
+    return _placed(config, capture, 0, runs, "all", settings.seed)
 
 
-def _joint_config(capture: Capture, pose_run: Path, bundle: Path, settings: Settings) -> TrainerConfig:
+def _joint_config(capture: Capture, pose_run: Path, runs: Path, settings: Settings) -> TrainerConfig:
     config = copy.deepcopy(joint_method.config)
-    config.bundle_dir = bundle
+    config.bundle_dir = runs.parent
     config.pipeline.pose_run = pose_run
     config.pipeline.root = settings.root
     config.pipeline.joints = tuple(settings.joints)
     config.pipeline.seed = settings.seed
     config.pipeline.settings = asdict(settings)
-    return _with_data(config, capture, 0, settings.seed)
+    return _placed(config, capture, 0, runs, "all", settings.seed)
+
+
+def _placed(
+    config: TrainerConfig, capture: Capture, state: int, runs: Path, experiment: str, seed: int
+) -> TrainerConfig:
+    """With its capture, its run folder, and none of what `ns-train` shows and saves meanwhile."""
+    config.data = capture.path.absolute()
+    config.pipeline.datamanager.data = config.data
+    config.pipeline.datamanager.dataparser.data = config.data
+    config.pipeline.datamanager.dataparser.state = state
+    config.machine.seed = seed
+    config.output_dir = runs
+    config.experiment_name = experiment
+    config.timestamp = "fit"
+    config.vis = "tensorboard"  # any but the viewer, whose server would outlive the stage
+    config.logging.local_writer.enable = False
+    config.logging.steps_per_log = 100
+    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
+    config.steps_per_save = config.max_num_iterations + 1  # at the end only: a stage is repeated as a whole
+    return config
+
+
+def _config_file(config: TrainerConfig) -> Path:
+    return config.get_base_dir() / "config.yml"
 
 
 def _is_whole(bundle: Path) -> bool:
@@ -231,71 +260,38 @@ def _is_whole(bundle: Path) -> bool:
     return True
 
 
-def _with_data(config: TrainerConfig, capture: Capture, state: int, seed: int) -> TrainerConfig:
-    config.data = capture.path.absolute()
-    config.pipeline.datamanager.data = config.data
-    config.pipeline.datamanager.dataparser.data = config.data
-    config.pipeline.datamanager.dataparser.state = state
-    config.machine.seed = seed
-    return config
+def _train(
+    stages: dict[str, TrainerConfig], rasterizer: Backend, report: Report, progress: Progress, whole: bool = True
+) -> None:
+    """Train stages that do not need each other, but those that are done and whose results are `whole`."""
+    missing: dict[str, TrainerConfig] = {}
+    tasks = []
+    for name, config in stages.items():
+        run = config.get_base_dir()
+        task = progress.add_task(name, total=config.max_num_iterations)
+        if report.resume(name, whole and any(run.glob("nerfstudio_models/step-*.ckpt"))):
+            progress.update(task, completed=config.max_num_iterations)
+        else:
+            shutil.rmtree(run, ignore_errors=True)
+            missing[name] = config
+            tasks.append(task)
 
+    def on_step(index: int, steps: int) -> None:
+        progress.update(tasks[index], completed=steps)
 
-def _run(
-    stage: str,
-    config: TrainerConfig,
-    output_dir: Path,
-    experiment: str,
-    report: Report,
-    progress: Progress,
-    whole: bool = True,
-) -> Path:
-    """Train one stage, unless it is done and its results are `whole`; returns the run's config.yml."""
-    config.output_dir = output_dir / "runs"
-    config.experiment_name = experiment
-    config.timestamp = "fit"
-    config.vis = "tensorboard"  # any but the viewer, whose server would outlive the stage
-    config.logging.local_writer.enable = False
-    config.logging.steps_per_log = 100
-    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
-    config.steps_per_save = config.max_num_iterations + 1  # at the end only: a stage is repeated as a whole
-    run = config.get_base_dir()
-    task = progress.add_task(stage, total=config.max_num_iterations)
-    if report.resume(stage, whole and any(run.glob("nerfstudio_models/step-*.ckpt"))):
-        progress.update(task, completed=config.max_num_iterations)
-        return run / "config.yml"
-    shutil.rmtree(run, ignore_errors=True)
-    seed_everything(config.machine.seed)
-    start = time.perf_counter()
-    config.save_config()
-    trainer: Trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    trainer.callbacks.append(
-        TrainingCallback(
-            [TrainingCallbackLocation.AFTER_TRAIN_ITERATION], lambda step: progress.update(task, completed=step + 1)
-        )
+    runs = list(missing.values())
+    processes = num_processes(
+        len(stages)
+    )  # of all stages: a fit that goes on has the results of one that was not ended
+    outcomes = (
+        (run_stage(config, partial(on_step, index)) for index, config in enumerate(runs))
+        if processes == 1
+        else run_side_by_side(runs, processes, rasterizer, on_step)
     )
-    trainer.train()
-    progress.update(task, completed=config.max_num_iterations)
-    notes = getattr(trainer.pipeline, "notes", [])
-    for note in notes:
-        progress.console.print(note, markup=False, soft_wrap=True)
-    report.add(
-        name=stage,
-        seconds=round(time.perf_counter() - start, 2),
-        iterations=config.max_num_iterations,
-        gaussians=trainer.pipeline.model.num_points,
-        peak_memory_mb=_peak_memory_mb(),
-        notes=notes,
-    )
-    return run / "config.yml"
-
-
-def _peak_memory_mb() -> int:
-    """Of the GPU where there is one, else of this process so far."""
-    if torch.cuda.is_available():
-        return torch.cuda.max_memory_allocated() // 2**20
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak // (2**20 if sys.platform == "darwin" else 2**10)
+    for name, outcome in zip(missing, outcomes, strict=True):
+        for note in outcome["notes"]:
+            progress.console.print(note, markup=False, soft_wrap=True)
+        report.add(name, outcome)
 
 
 @contextmanager

@@ -1,0 +1,85 @@
+"""Runs side by side: what they tell, and that none outlives the fit that started it."""
+
+import json
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from splatart_ns.capture.formats import load_capture
+from splatart_ns.errors import InputError
+from splatart_ns.plugin.fit import Settings, _semantic_config
+from splatart_ns.plugin.stage_run import num_processes, run_side_by_side
+
+
+@pytest.fixture
+def configs(hinge_capture, tmp_path):
+    """A few steps of stage 1 for both states of a capture that a test may spoil."""
+    capture = load_capture(shutil.copytree(hinge_capture, tmp_path / "capture"))
+    configs = [_semantic_config(capture, k, tmp_path / "runs", Settings("draft", None, 0)) for k in range(2)]
+    for config in configs:
+        config.max_num_iterations, config.pipeline.model.semantic_start = 4, 2
+        config.pipeline.datamanager.seed_gaussians = 100
+    return configs
+
+
+def test_outcomes_come_in_order_and_every_run_is_saved(configs):
+    steps = {0: [], 1: []}
+    outcomes = list(run_side_by_side(configs, 2, "auto", lambda index, done: steps[index].append(done)))
+    assert [outcome["iterations"] for outcome in outcomes] == [4, 4]
+    assert all(outcome["gaussians"] > 0 and outcome["seconds"] > 0 for outcome in outcomes)
+    assert all(done == sorted(done) and done[-1] == 4 for done in steps.values())
+    assert all(list(config.get_base_dir().glob("nerfstudio_models/step-*.ckpt")) for config in configs)
+
+
+def test_one_process_after_the_other_leaves_the_same(configs, tmp_path):
+    def saved():
+        return [next(c.get_base_dir().glob("nerfstudio_models/step-*.ckpt")).read_bytes() for c in configs]
+
+    list(run_side_by_side(configs, 2, "auto", lambda *_: None))
+    beside = saved()
+    shutil.rmtree(tmp_path / "runs")
+    list(run_side_by_side(configs[:1], 2, "auto", lambda *_: None))
+    list(run_side_by_side(configs[1:], 2, "auto", lambda *_: None))
+    assert saved() == beside
+
+
+def test_a_users_mistake_in_a_run_is_told_as_one(configs, tmp_path):
+    (tmp_path / "capture/state_01/transforms.json").unlink()
+    with pytest.raises(InputError):
+        list(run_side_by_side(configs, 2, "auto", lambda *_: None))
+
+
+def test_a_run_that_breaks_shows_its_last_words(configs):
+    configs[1].pipeline.datamanager.seed = "no number"
+    with pytest.raises(RuntimeError, match="Traceback"):
+        list(run_side_by_side(configs, 2, "auto", lambda *_: None))
+
+
+def test_a_run_ends_with_the_process_that_started_it(configs):
+    configs[0].max_num_iterations = 10**6
+    process = subprocess.Popen(
+        [sys.executable, "-m", "splatart_ns.plugin.stage_run"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        pickle.dump((configs[0], "auto"), process.stdin)
+        process.stdin.flush()
+        assert json.loads(process.stdout.readline())["kind"] == "step"
+        process.stdin.close()  # as when the other end dies
+        assert process.wait(timeout=30) == 1
+    finally:
+        process.kill()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="one GPU trains one run at a time")
+@pytest.mark.parametrize(("threads", "runs", "processes"), [("1", 3, 1), ("4", 3, 3), ("4", 8, 4)])
+def test_no_more_processes_than_cores_the_user_grants(monkeypatch, threads, runs, processes):
+    monkeypatch.setitem(os.environ, "OMP_NUM_THREADS", threads)
+    assert num_processes(runs) == processes
