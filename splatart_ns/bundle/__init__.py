@@ -1,6 +1,7 @@
 """The result of a fit: on disk, in memory, and in any configuration."""
 
 from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint, Part
+from splatart_ns.bundle.configuration_fit import ConfigurationFit, fit_configuration
 from splatart_ns.bundle.folder import load_bundle, save_bundle
 from splatart_ns.bundle.posing import (
     configured_motions,
@@ -16,9 +17,11 @@ from splatart_ns.bundle.posing import (
 __all__ = [
     "JOINT_DOFS",
     "Bundle",
+    "ConfigurationFit",
     "Joint",
     "Part",
     "configured_motions",
+    "fit_configuration",
     "joint_motion",
     "load_bundle",
     "moved_splat",

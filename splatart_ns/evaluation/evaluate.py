@@ -17,6 +17,7 @@ from splatart_ns.capture.view import load_views
 from splatart_ns.errors import InputError
 from splatart_ns.evaluation.geometry import chamfer_centres
 from splatart_ns.evaluation.ground_truth import GroundTruth, load_ground_truth
+from splatart_ns.evaluation.held_out import held_out_scores
 from splatart_ns.evaluation.images import image_scores, is_mapped, novel_motions
 from splatart_ns.evaluation.joints import joint_errors, mean_errors
 from splatart_ns.evaluation.parts import part_pose_errors
@@ -50,13 +51,17 @@ def evaluate(bundle_folder: Path, capture_path: Path, device: torch.device | str
         "parts": [],
         "geometry": {"mesh": None, "centres": None},
         "images": {},
+        "held_out": {},
         "speed": {},
     }
     if truth is None:
         notes.append("joints, structure, parts, geometry: the capture has no ground_truth.json")
     else:
         _score_model(metrics, notes, bundle, truth, len(capture.states), capture_path)
-    _score_images(metrics, notes, bundle, truth, capture, load_novel(capture_path), device)
+    novel = load_novel(capture_path)
+    _score_images(metrics, notes, bundle, truth, capture, novel, device)
+    for state in novel:
+        metrics["held_out"][state.name] = held_out_scores(bundle, capture, state, device)
     report = bundle_folder / "report.json"
     if report.is_file():
         metrics["speed"] = read_record(report, "run `splatart fit` again").fields

@@ -26,6 +26,12 @@ _IMAGE_COLUMNS = {
     "accumulation_l1": "accumulation\nL1",
     "part_iou": "part IoU\n",
 }
+_HELD_OUT_COLUMNS = {
+    "residual": "residual\n",
+    "fitted_residual": "residual of\nfitted states",
+    "psnr": "PSNR\ndB",
+    "part_iou": "part IoU\n",
+}
 _CHAMFER_COLUMNS = {"CD-s": "CD-s", "CD-m": "CD-m", "CD-w": "CD-w"}
 
 
@@ -52,6 +58,9 @@ def format_tables(metrics: dict[str, Any]) -> list[Table | Text]:
             for row in [(name, "state 0", values), (name, "last state", values["last"])]
         ]),
         _table("Images, test views", ["configuration"], _IMAGE_COLUMNS, list(metrics["images"].items())),
+        _table("Held-out configurations, values found in images", ["configuration"], _HELD_OUT_COLUMNS, list(
+            metrics["held_out"].items()
+        )),
     ]  # fmt: skip
     lines = [f"{key}: {_shown(value)}" for key, value in metrics["structure"].items()]
     lines += [f"note: {note}" for note in metrics["notes"]]

@@ -62,6 +62,12 @@ class PartView:
         )
         return torch.cat([image, accumulation], -1)
 
+    def difference(self, splat: Splat, T: Tensor) -> Tensor:
+        """How the splat under motions [K, 4, 4] differs from the part [K, H, W, 4], colours by `RGB_WEIGHT`."""
+        difference = self.render(splat, T) - self.rgba
+        difference[..., :3] *= RGB_WEIGHT
+        return difference
+
 
 def part_view(view: View, part: int, factor: int = 1, device: torch.device | None = None) -> PartView | None:
     """What `view` says of a part; None if it says nothing.
@@ -161,9 +167,7 @@ class PartPair:
         """
         for splat, views, motion in zip(self.splats, reversed(self.views), (T, inverse(T)), strict=True):
             for view in views:
-                difference = view.render(splat, motion) - view.rgba
-                difference[..., :3] *= RGB_WEIGHT
-                yield difference, view.weight
+                yield view.difference(splat, motion), view.weight
 
     def own_cost(self) -> float:
         """What `cost` would be if each state's Gaussians were looked at in their own state's views."""

@@ -3,6 +3,7 @@ import json
 import shutil
 
 import pytest
+import torch
 from rich.console import Console
 
 from splatart_ns.bundle import save_bundle
@@ -26,7 +27,8 @@ def printed(metrics) -> str:
 def test_a_perfect_estimate_scores_perfectly(folder, capture):
     (folder / "report.json").write_text('{"stages": {"semantic": {"seconds": 1.5}}}')
     metrics = evaluate(folder, capture)
-    assert list(metrics) == ["joints", "joints_mean", "structure", "parts", "geometry", "images", "speed", "notes"]
+    keys = ["joints", "joints_mean", "structure", "parts", "geometry", "images", "held_out", "speed", "notes"]
+    assert list(metrics) == keys
     assert metrics["structure"] == {"tree_exact": True, "edges_precision": 1.0, "edges_recall": 1.0}
     for kind in ("revolute", "prismatic"):
         assert metrics["joints_mean"][kind]["displacement"] == pytest.approx(0, abs=1e-6)
@@ -62,6 +64,24 @@ def test_without_ground_truth_there_are_image_scores_alone(folder, capture, tmp_
     assert any("no ground_truth.json" in note for note in metrics["notes"])
     assert any("novel_00" in note for note in metrics["notes"])
     assert "PSNR" in printed(metrics) and "Joints" not in printed(metrics)
+
+
+def test_a_held_out_configuration_scores_the_model_without_ground_truth(bundle, folder, capture, tmp_path):
+    plain = shutil.copytree(capture, tmp_path / "plain")
+    (plain / "ground_truth.json").unlink()
+    metrics = evaluate(folder, plain)
+    right = metrics["held_out"]["novel_00"]
+    assert right["values"] == pytest.approx({"hinge": 0.2, "slide": 0.1}, abs=0.01)
+    assert right["converged"] and right["unseen"] == []
+    assert right["psnr"] > 40 and right["part_iou"] > 0.95
+    assert right["residual"] < 3 * right["fitted_residual"]
+    assert "Held-out configurations" in printed(metrics)
+
+    bundle.joints[0].axis = torch.tensor([1.0, 0, 0], dtype=torch.float64)
+    save_bundle(bundle, folder)
+    wrong = evaluate(folder, plain)["held_out"]["novel_00"]
+    assert wrong["residual"] > 1.2 * right["residual"], (right, wrong)
+    assert wrong["psnr"] < right["psnr"] - 5
 
 
 def test_a_missing_part_counts_against_the_part_iou(bundle, folder, capture):

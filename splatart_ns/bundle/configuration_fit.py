@@ -1,0 +1,188 @@
+"""The configuration that images of the known object show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
+from splatart_ns.bundle.posing import configured_motions, joint_motion, normalized
+from splatart_ns.capture.capture import Normalization
+from splatart_ns.capture.view import View
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.part_pair import HUBER, PartView, best_views, huber, part_view
+
+_COARSE, _FINE = (5, 1500), (12, 10000)
+"""Views of a part, and the number of its pixels in each, in the search and in the refinement."""
+_TURN_SAMPLES, _SLIDE_SAMPLES = 72, 61
+_MAX_ITERATIONS = 20
+_STEP = 2e-3
+"""Forward differences: radians, and normalised lengths (the object has about unit size)."""
+
+
+@dataclass(frozen=True)
+class ConfigurationFit:
+    """A configuration, and how well the images agree."""
+
+    q: dict[str, Tensor]
+    """Value of every tree joint with a freedom; as at state 0 where no label shows the part or what hangs on it."""
+    converged: bool
+    residual: dict[str, float]
+    """Mean Huber cost per own pixel of each moving part that is seen, as `PartPair.cost`."""
+    unseen: list[str]
+    """Parts that no labelled view shows."""
+
+
+@torch.no_grad()
+def fit_configuration(bundle: Bundle, views: Sequence[View], normalization: Normalization) -> ConfigurationFit:
+    """Find the joint values at which the bundle's parts look like labelled views of one configuration.
+
+    Down the tree, each joint is swept over a full turn or its widened range (joints of several freedoms: over what was
+    observed), each part compared on its own pixels and the background; then all values together are refined by
+    Levenberg-Marquardt. The root stays where it is at state 0.
+
+    Args:
+        bundle: The object.
+        views: Of one configuration, in the normalised world.
+        normalization: Of the views' capture.
+    """
+    splats = {part.name: normalized(part.splat, normalization) for part in bundle.parts}
+    coarse, fine = ({part.name: _looks(views, part.id, *size) for part in bundle.parts} for size in (_COARSE, _FINE))
+    joints = [joint for joint in bundle.tree_joints if JOINT_DOFS[joint.type] > 0]
+    q = {joint.name: torch.zeros_like(joint.values[0]) for joint in joints}
+    for joint in joints:
+        if not coarse[joint.child]:
+            continue
+        parent = configured_motions(bundle, q)[joint.parent]
+        values = sweep_values(joint)
+        motions = torch.stack([parent @ joint_motion(joint, value) for value in values])
+        costs = _cost(splats[joint.child], coarse[joint.child], _to_normal(motions, normalization))
+        q[joint.name] = values[int(costs.argmin())]
+
+    def motions_at(x: Tensor) -> dict[str, Tensor]:
+        """Of a batch of all values [K, D]: T[part] [K, 4, 4] in the normalised world."""
+        each = [configured_motions(bundle, _split(joints, row)) for row in x]
+        return {
+            name: _to_normal(torch.stack([motions[name] for motions in each]), normalization)
+            for name in bundle.part_names
+        }
+
+    unseen = [part.name for part in bundle.parts if not coarse[part.name]]
+    moving = {joint.child: splats[joint.child] for joint in joints if fine[joint.child]}
+    if not moving:
+        return ConfigurationFit(q, True, {}, unseen)
+    x = torch.cat([q[joint.name].reshape(-1) for joint in joints])
+    scale = torch.cat([_units(joint, normalization) for joint in joints])
+    x, converged = _refine(moving, fine, motions_at, x, scale)
+    final = motions_at(x[None])
+    residual = {name: float(_cost(splat, fine[name], final[name])[0]) for name, splat in moving.items()}
+    return ConfigurationFit(_split(joints, x), converged, residual, unseen)
+
+
+@torch.no_grad()
+def appearance_residuals(
+    bundle: Bundle, motions: Mapping[str, Tensor], views: Sequence[View], normalization: Normalization
+) -> dict[str, float]:
+    """`ConfigurationFit.residual` of all parts that views show, where the parts' motions T[part] are known."""
+    residuals = {}
+    for part in bundle.parts:
+        if looks := _looks(views, part.id, *_FINE):
+            T = _to_normal(motions[part.name][None], normalization)
+            residuals[part.name] = float(_cost(normalized(part.splat, normalization), looks, T)[0])
+    return residuals
+
+
+def sweep_values(joint: Joint) -> Tensor:
+    """Values [K] or [K, D] among which to look for that of a joint: in all a turn, in a slide three times its range."""
+    if JOINT_DOFS[joint.type] > 1:
+        return joint.values
+    low, high = joint.limits or (0.0, 0.0)
+    if joint.type == "revolute":
+        turn = torch.arange(_TURN_SAMPLES, dtype=torch.float64) * (2 * math.pi / _TURN_SAMPLES)
+        middle = (low + high) / 2
+        return middle + torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
+    return torch.linspace(2 * low - high, 2 * high - low, _SLIDE_SAMPLES, dtype=torch.float64)
+
+
+def _looks(views: Sequence[View], part: int, count: int, pixels: int) -> list[PartView]:
+    chosen = [view for view in best_views(views, part, count) if view.labels is not None]
+    if not chosen:
+        return []
+    area = sum(float((view.labels == part).sum()) for view in chosen) / len(chosen)
+    factor = max(1, int((area / pixels) ** 0.5))
+    return [look for view in chosen if (look := part_view(view, part, factor)) is not None]
+
+
+def _cost(splat: Splat, looks: Sequence[PartView], T: Tensor) -> Tensor:
+    """Mean Huber cost per own pixel of motions T [K, 4, 4]: [K] float64."""
+    total = torch.zeros(len(T), dtype=torch.float64)
+    for look in looks:
+        total += (huber(look.difference(splat, T)).sum(-1) * look.weight).sum((1, 2)).double()
+    return total / max(sum(look.area / look.factor**2 for look in looks), 1.0)
+
+
+def _refine(
+    splats: Mapping[str, Splat],
+    looks: Mapping[str, Sequence[PartView]],
+    motions_at: Callable[[Tensor], dict[str, Tensor]],
+    x: Tensor,
+    scale: Tensor,
+) -> tuple[Tensor, bool]:
+    """Levenberg-Marquardt on the values x [D] in units of `scale`, with Huber weights; and whether it converged."""
+    D, damping, converged = len(x), 1e-3, False
+    steps = torch.cat([torch.zeros(1, D, dtype=x.dtype), _STEP * torch.diag(scale)])
+
+    def equations(x: Tensor) -> tuple[Tensor, Tensor, float]:
+        H, g, cost = torch.zeros(D, D, dtype=x.dtype), torch.zeros(D, dtype=x.dtype), 0.0
+        motions = motions_at(x + steps)
+        for name, splat in splats.items():
+            moving = [0] + [k + 1 for k in range(D) if not torch.equal(motions[name][k + 1], motions[name][0])]
+            for look in looks[name]:
+                difference = look.difference(splat, motions[name][moving])
+                r = difference[0].reshape(-1)
+                J = torch.zeros(D, len(r), dtype=r.dtype)
+                J[[k - 1 for k in moving[1:]]] = (difference[1:].reshape(len(moving) - 1, -1) - r) / _STEP
+                w = look.weight[..., None].expand(difference.shape[1:]).reshape(-1)
+                wJ = J * (w * (HUBER / r.abs().clamp_min(1e-12)).clamp_max(1.0))
+                H += (wJ @ J.T).double()
+                g += (wJ @ r).double()
+                cost += float((w * huber(r)).sum())
+        return H, g, cost
+
+    H, g, cost = equations(x)
+    for _ in range(_MAX_ITERATIONS):
+        step = -torch.linalg.solve(H + damping * H.diagonal().clamp_min(1e-9).diag(), g)
+        trial = equations(x + scale * step)
+        if trial[2] < cost:
+            x, damping = x + scale * step, damping * 0.3
+            H, g, cost = trial
+        else:
+            damping = max(damping, 1e-3) * 10
+        if float(step.abs().max()) < 0.1 * _STEP or damping > 1e4:
+            converged = True
+            break
+    return x, converged
+
+
+def _split(joints: Sequence[Joint], x: Tensor) -> dict[str, Tensor]:
+    widths = [joint.values[0].numel() for joint in joints]
+    return {j.name: v.reshape(j.values[0].shape) for j, v in zip(joints, x.split(widths), strict=True)}
+
+
+def _units(joint: Joint, normalization: Normalization) -> Tensor:
+    """What one unit of refinement is in each value: a radian, or a normalised length."""
+    length = 1 / normalization.scale
+    units = {
+        "prismatic": [length],
+        "cylindrical": [length, 1.0],
+        "free": [length] * 3 + [1.0] * 3,
+    }.get(joint.type, [1.0] * JOINT_DOFS[joint.type])
+    return torch.tensor(units, dtype=torch.float64)
+
+
+def _to_normal(T: Tensor, normalization: Normalization) -> Tensor:
+    return torch.from_numpy(normalization.motion_to_normal(T.numpy()))
