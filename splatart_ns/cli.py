@@ -74,7 +74,8 @@ def render(
     Args:
         bundle: Folder that `splatart fit` left.
         output: A folder for PNG frames, or a .gif or .mp4 file.
-        set: Joint values, joint=value: radians, or degrees as 30deg, or a length. Joints not named are as in state 0.
+        set: Joint values, joint=value: radians, or degrees as 30deg, or a length; joints of several freedoms take as
+            many, lengths first: ball=10deg,0,5deg. Joints not named are as in state 0.
         sweep: Move one joint after the other over its observed range.
         trajectory: CSV file: a header of joint names, and a row of values a frame.
         channel: What to show.

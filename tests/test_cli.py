@@ -78,7 +78,7 @@ def test_eval_writes_all_metrics(run_main, bundle, hinge_capture):
     assert code == 0
     assert "lid" in output and "tree_exact: yes" in output
     metrics = json.loads((bundle / "metrics.json").read_text())
-    layout = {"joints", "joints_mean", "structure", "parts", "geometry", "images", "speed", "notes"}
+    layout = {"joints", "joints_mean", "structure", "parts", "geometry", "images", "held_out", "speed", "notes"}
     assert set(metrics) == layout
     (joint,) = metrics["joints"]
     assert (joint["child"], joint["parent"], joint["type"]) == ("lid", "base", "revolute")

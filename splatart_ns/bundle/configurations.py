@@ -7,16 +7,22 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
 from splatart_ns.errors import InputError
 
-Configuration = dict[str, float]
-"""Joint name to value, radian or length; joints that are not named are at 0, where state 0 has them."""
+Configuration = dict[str, float | list[float]]
+"""Joint name to value, radian or length, or to as many as the joint has freedoms (`Joint.values`); joints that are not
+named are at 0, where state 0 has them."""
+
+_LENGTHS = {"prismatic": 1, "cylindrical": 1, "free": 3}
+"""How many of a joint's first values are lengths; the others are angles."""
 
 
 def movable_joints(bundle: Bundle) -> dict[str, Joint]:
-    """The tree's joints that one number sets, by name, parents before children."""
-    return {joint.name: joint for joint in bundle.tree_joints if JOINT_DOFS[joint.type] == 1}
+    """The tree's joints with a freedom, by name, parents before children."""
+    return {joint.name: joint for joint in bundle.tree_joints if JOINT_DOFS[joint.type] > 0}
 
 
 def parse_settings(settings: Sequence[str], bundle: Bundle) -> Configuration:
@@ -33,37 +39,61 @@ def parse_settings(settings: Sequence[str], bundle: Bundle) -> Configuration:
     return configuration
 
 
-def parse_value(text: str, joint: Joint, where: str) -> float:
-    """A joint's value: a plain number in the bundle's unit (radian or length), or with the suffix `deg` an angle."""
-    number = text.strip()
+def parse_value(text: str, joint: Joint, where: str) -> float | list[float]:
+    """A joint's value: a plain number in the bundle's unit (radian or length), or with the suffix `deg` an angle.
+
+    Joints of several freedoms take as many, with commas between: lengths first, then angles.
+    """
+    dofs, lengths = JOINT_DOFS[joint.type], _LENGTHS.get(joint.type, 0)
+    numbers = text.split(",")
+    if len(numbers) != dofs:
+        raise InputError(
+            f"{where}: '{text.strip()}' is {len(numbers)} numbers but joint '{joint.name}' is {joint.type}; give {dofs}"
+        )
+    values = [_parse_number(n.strip(), joint, i < lengths, where) for i, n in enumerate(numbers)]
+    return values[0] if dofs == 1 else values
+
+
+def _parse_number(number: str, joint: Joint, is_length: bool, where: str) -> float:
     degrees = number.lower().endswith("deg")
-    if degrees and joint.type == "prismatic":
-        raise InputError(f"{where}: '{text.strip()}' is an angle but joint '{joint.name}' slides; give a length")
+    if degrees and is_length:
+        raise InputError(f"{where}: '{number}' is an angle but joint '{joint.name}' slides; give a length")
     try:
         value = float(number[:-3] if degrees else number)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"{where}: '{text.strip()}' for joint '{joint.name}' is no number; write 0.5 or 30deg")
+        raise InputError(f"{where}: '{number}' for joint '{joint.name}' is no number; write 0.5 or 30deg")
     return math.radians(value) if degrees else value
 
 
-def sweep(bundle: Bundle, base: Mapping[str, float], frames_per_joint: int) -> list[Configuration]:
-    """One movable joint after the other over its observed range, there and back, the others as in `base`.
+def sweep(bundle: Bundle, base: Mapping[str, float | list[float]], frames_per_joint: int) -> list[Configuration]:
+    """One movable joint after the other over what was observed, there and back, the others as in `base`.
 
-    Each joint moves like a cosine, begins and ends at its value in `base` (0 where it has none).
+    A joint of one freedom moves over its range like a cosine; it begins and ends at its value in `base` (0 where it has
+    none). One of several goes through its values at the states in turn, and back.
     """
     configurations = []
     for name, joint in movable_joints(bundle).items():
-        low, high = joint.limits
-        if low == high:
-            continue
-        start = min(max(base.get(name, 0.0), low), high)
-        phase = math.acos(1 - 2 * (start - low) / (high - low))
-        for frame in range(frames_per_joint):
-            angle = phase + 2 * math.pi * frame / frames_per_joint
-            configurations.append({**base, name: low + (high - low) * (1 - math.cos(angle)) / 2})
+        values = _sweep_values(joint, base.get(name, 0.0), frames_per_joint)
+        configurations += [{**base, name: value} for value in values]
     return configurations or [dict(base)]
+
+
+def _sweep_values(joint: Joint, start: float | list[float], frames: int) -> list[float] | list[list[float]]:
+    """None for a joint that did not move."""
+    if JOINT_DOFS[joint.type] > 1:
+        if not joint.values.any():
+            return []
+        states = np.arange(len(joint.values))
+        at = len(states[1:]) * (1 - np.cos(2 * np.pi * np.arange(frames) / frames)) / 2
+        return np.stack([np.interp(at, states, column) for column in joint.values.numpy().T], axis=1).tolist()
+    low, high = joint.limits
+    if low == high:
+        return []
+    start = min(max(start, low), high)
+    angles = math.acos(1 - 2 * (start - low) / (high - low)) + 2 * np.pi * np.arange(frames) / frames
+    return (low + (high - low) * (1 - np.cos(angles)) / 2).tolist()
 
 
 def read_trajectory(path: Path, bundle: Bundle) -> list[Configuration]:

@@ -2,11 +2,21 @@ import math
 
 import pytest
 
+from splatart_ns.bundle import configured_motions
 from splatart_ns.bundle.configurations import movable_joints, parse_settings, read_trajectory, sweep
 from splatart_ns.errors import InputError
 
 
-def test_joints_with_one_value_are_movable_parents_first(bundle):
+@pytest.fixture
+def with_ball(bundle):
+    """Its loop taken into the tree as a joint of three freedoms, by other parts."""
+    ball = next(joint for joint in bundle.joints if joint.type == "spherical")
+    bundle.joints.remove(next(joint for joint in bundle.joints if joint.name == "slide"))
+    ball.in_tree, ball.parent, ball.child = True, "base", "latch"
+    return bundle
+
+
+def test_joints_with_a_freedom_are_movable_parents_first(bundle):
     assert list(movable_joints(bundle)) == ["hinge", "slide"]
     bundle.joints[0].type = "fixed"
     assert list(movable_joints(bundle)) == ["hinge"]
@@ -54,6 +64,24 @@ def test_a_sweep_starts_where_the_joint_is_set_and_keeps_the_others(bundle):
     assert frames[0] == {"hinge": pytest.approx(0.3), "slide": -0.1}
     assert frames[20] == {"hinge": 0.3, "slide": pytest.approx(-0.1)}
     assert max(q["hinge"] for q in frames) == pytest.approx(math.pi / 2, abs=0.05)
+
+
+def test_a_joint_of_three_freedoms_takes_three_values(with_ball):
+    (closure,) = parse_settings(["closure=0.1, 30deg,-1"], with_ball).values()
+    assert closure == pytest.approx([0.1, math.pi / 6, -1])
+    with pytest.raises(InputError, match="is spherical; give 3"):
+        parse_settings(["closure=0.1"], with_ball)
+    with_ball.joints[-1].type = "free"
+    with pytest.raises(InputError, match="slides"):
+        parse_settings(["closure=0,0,3deg,0,0,0"], with_ball)
+
+
+def test_a_joint_of_three_freedoms_sweeps_through_what_was_observed(with_ball):
+    frames = [q["closure"] for q in sweep(with_ball, {"closure": [9, 9, 9]}, 8) if q["closure"] != [9, 9, 9]]
+    assert len(frames) == 8
+    assert frames[0] == [0, 0, 0] and frames[4] == pytest.approx([0.1, 0.2, 0.3])
+    assert frames[2] == pytest.approx([0.05, 0.1, 0.15]) and frames[6] == pytest.approx(frames[2])
+    assert all(set(configured_motions(with_ball, {"closure": value})) == {"base", "door", "latch"} for value in frames)
 
 
 def test_a_sweep_of_joints_that_did_not_move_is_one_frame(bundle):
