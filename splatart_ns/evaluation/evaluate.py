@@ -15,7 +15,7 @@ from splatart_ns.capture.capture import Capture, State
 from splatart_ns.capture.formats import load_capture, load_novel
 from splatart_ns.capture.view import load_views
 from splatart_ns.errors import InputError
-from splatart_ns.evaluation.geometry import chamfer_centres
+from splatart_ns.evaluation.geometry import chamfer_centres, chamfer_mesh
 from splatart_ns.evaluation.ground_truth import GroundTruth, load_ground_truth
 from splatart_ns.evaluation.held_out import held_out_scores
 from splatart_ns.evaluation.images import image_scores, is_mapped, novel_motions
@@ -94,7 +94,7 @@ def _score_model(
     metrics["structure"] = structure_scores(truth, bundle)
     metrics["parts"] = part_pose_errors(truth, bundle)
     metrics["geometry"]["centres"] = chamfer_centres(truth, bundle)
-    notes.append("geometry.mesh: part meshes are not extracted")
+    metrics["geometry"]["mesh"] = chamfer_mesh(truth, bundle)
 
 
 def _score_images(

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from scipy.spatial import cKDTree
 
 from splatart_ns.bundle.bundle import Bundle
+from splatart_ns.bundle.surface import part_surface
+from splatart_ns.errors import InputError
 from splatart_ns.evaluation.ground_truth import GroundTruth
 from splatart_ns.geometry.se3 import transform_points
 
@@ -44,21 +48,51 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def chamfer_centres(ground_truth: GroundTruth, bundle: Bundle) -> dict[str, Any]:
-    """CD-s (root part), CD-m (mean over the moving parts) and CD-w (all) between true points and Gaussian centres.
+    """The figures of `_chamfers` for the Gaussians' centres, of which farthest-point samples are taken."""
+    centres = {part.id: part.splat.means.double().numpy() for part in bundle.parts if len(part.splat)}
+    sampled = {part: x[farthest_points(x, SAMPLES)] for part, x in centres.items()}
+    return _chamfers(ground_truth, bundle, sampled, *_sampled_whole(centres))
 
-    Farthest-point samples at state 0 stand for the centres and, in CD-w, for the true points. "parts" has each part's
-    value; "last" the same numbers at the last state, both sides moved by their own motions relative to the true root
-    (the estimate's own root where it lacks that part).
+
+def chamfer_mesh(ground_truth: GroundTruth, bundle: Bundle) -> dict[str, Any]:
+    """The figures of `_chamfers` for the parts' surfaces, sampled by area; a part without one counts as missing."""
+    meshes = {}
+    for part in bundle.parts:
+        # A part without visible Gaussians has no surface.
+        with contextlib.suppress(InputError):
+            meshes[part.id] = part_surface(part.splat)
+    sampled = {part: trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)[0] for part, mesh in meshes.items()}
+    if not meshes:
+        return _chamfers(ground_truth, bundle, {}, *_sampled_whole({}))
+    whole = trimesh.util.concatenate(list(meshes.values()))
+    points, face = trimesh.sample.sample_surface(whole, SAMPLES, seed=0)
+    part_of_face = np.repeat(list(meshes), [len(mesh.faces) for mesh in meshes.values()])
+    return _chamfers(ground_truth, bundle, sampled, points, part_of_face[face])
+
+
+def _chamfers(
+    ground_truth: GroundTruth,
+    bundle: Bundle,
+    sampled: dict[int, np.ndarray],
+    whole: np.ndarray,
+    whole_part: np.ndarray,
+) -> dict[str, Any]:
+    """CD-s (root part), CD-m (mean over the moving parts) and CD-w (all) between true and estimated points.
+
+    Args:
+        sampled: The estimate's points of each part that has any [N, 3].
+        whole, whole_part: Points of all parts together [M, 3], and the part of each [M]. For the true points, farthest-
+            point samples of all parts' together.
+
+    Returns:
+        The figures at state 0, "parts" with each part's value, and "last" with the same at the last state, both sides
+        moved by their own motions relative to the true root (the estimate's own root where it lacks that part).
     """
     true_points = {part: ground_truth.points[part].numpy() for part in ground_truth.parts}
-    centres = {part.id: part.splat.means.double().numpy() for part in bundle.parts if len(part.splat)}
     true_motions = {part: T[-1] for part, T in _relative(ground_truth.motions, ground_truth.root).items()}
     estimated = {part.id: part.motion for part in bundle.parts}
     root = ground_truth.root if ground_truth.root in estimated else bundle.part(bundle.root).id
     motions = {part: T[-1] for part, T in _relative(estimated, root).items()}
-
-    sampled = {part: x[farthest_points(x, SAMPLES)] for part, x in centres.items()}
-    whole, whole_part = _sampled_whole(centres)
     true_whole, true_whole_part = _sampled_whole(true_points)
 
     def values(last: bool) -> dict[str, Any]:
@@ -77,10 +111,10 @@ def chamfer_centres(ground_truth: GroundTruth, bundle: Bundle) -> dict[str, Any]
             "CD-s": parts[ground_truth.parts[ground_truth.root]],
             "CD-m": sum(found) / len(found) if found else None,
             "CD-w": chamfer(
-                np.concatenate([at(whole[whole_part == part], motions[part]) for part in centres]),
+                np.concatenate([at(whole[whole_part == part], motions[part]) for part in sampled]),
                 np.concatenate([at(true_whole[true_whole_part == part], true_motions[part]) for part in true_points]),
             )
-            if centres
+            if sampled
             else None,
             "parts": parts,
         }

@@ -1,6 +1,7 @@
 """A cabinet of three parts, as ground truth, as a perfect estimate, and as a capture on disk."""
 
 import copy
+import functools
 import json
 import math
 
@@ -20,6 +21,8 @@ from splatart_ns.bundle import (
     observed_motions,
     part_features,
 )
+from splatart_ns.bundle.surface import part_surface
+from splatart_ns.evaluation import geometry
 from splatart_ns.evaluation.ground_truth import GroundTruth, NovelState, TrueJoint
 from splatart_ns.evaluation.images import predicted_parts
 from splatart_ns.geometry.camera import viewmat_from_opengl
@@ -200,3 +203,9 @@ def capture(tmp_path_factory):
         write_state(folder / "eval" / "novel_00", bundle, configured_motions(bundle, NOVEL))
     write_truth(folder)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def coarse_surfaces(monkeypatch):
+    """Meshes of large voxels, which take a fraction of a second."""
+    monkeypatch.setattr(geometry, "part_surface", functools.partial(part_surface, voxels=10_000))

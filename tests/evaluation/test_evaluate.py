@@ -33,7 +33,7 @@ def test_a_perfect_estimate_scores_perfectly(folder, capture):
     for kind in ("revolute", "prismatic"):
         assert metrics["joints_mean"][kind]["displacement"] == pytest.approx(0, abs=1e-6)
     assert metrics["parts"][0]["part_rotation"] == pytest.approx(0, abs=1e-5)
-    assert metrics["geometry"]["mesh"] is None
+    assert set(metrics["geometry"]["mesh"]) == {"CD-s", "CD-m", "CD-w", "parts", "last"}
     assert metrics["geometry"]["centres"]["CD-w"] == pytest.approx(0, abs=1e-6)
     assert list(metrics["images"]) == ["state_00", "state_01", "novel_00"]
     for scores in metrics["images"].values():

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatart_ns.evaluation.geometry import chamfer, chamfer_centres, farthest_points
+from splatart_ns.evaluation.geometry import chamfer, chamfer_centres, chamfer_mesh, farthest_points
 
 
 def test_chamfer_sums_mean_squared_distances_of_both_directions():
@@ -59,5 +59,24 @@ def test_a_wrong_motion_shows_at_the_last_state_alone(truth, bundle):
 def test_a_missing_part_is_null(truth, bundle):
     bundle.parts.pop(2)
     values = chamfer_centres(truth, bundle)
+    assert values["parts"]["latch"] is None
+    assert values["CD-m"] == values["parts"]["door"]
+
+
+def test_the_mesh_is_scored_at_both_ends(truth, bundle):
+    values = chamfer_mesh(truth, bundle)
+    for at in (values, values["last"]):
+        # Sixty true points in each half of a unit: no surface around them lies further off than their spread.
+        assert all(0 < at[key] < 1000 * 2 * 0.3**2 for key in ("CD-s", "CD-m", "CD-w"))
+    bundle.parts[2].motion = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    wrong = chamfer_mesh(truth, bundle)
+    assert wrong["parts"] == values["parts"]
+    assert wrong["last"]["parts"]["latch"] > values["last"]["parts"]["latch"] + 1
+    assert wrong["last"]["CD-s"] == values["last"]["CD-s"]
+
+
+def test_a_part_that_nobody_sees_has_no_mesh(truth, bundle):
+    bundle.parts[2].splat.opacity_logits[:] = -10
+    values = chamfer_mesh(truth, bundle)
     assert values["parts"]["latch"] is None
     assert values["CD-m"] == values["parts"]["door"]

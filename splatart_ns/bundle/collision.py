@@ -1,0 +1,97 @@
+"""Convex pieces that stand for a mesh where bodies collide."""
+
+from __future__ import annotations
+
+import logging
+
+import manifold3d
+import numpy as np
+import trimesh
+
+_log = logging.getLogger(__name__)
+
+_TRIANGLES = 1500
+"""Of the mesh that is taken apart: the time grows fast with their number."""
+_CONCAVITY = 0.08
+"""Tolerated difference between a piece and its hull, in CoACD's measure, of the mesh scaled to sides of 2."""
+
+
+def convex_pieces(mesh: trimesh.Trimesh, *, pieces: int = 12, vertices: int = 32) -> list[trimesh.Trimesh]:
+    """Watertight convex meshes that together are close to `mesh`, in its frame; its one convex hull without `coacd`.
+
+    By collision-aware concavity and tree search (Wei et al. 2022, "Approximate Convex Decomposition for 3D Meshes with
+    Collision-Aware Concavity and Tree Search"). Deterministic.
+
+    Args:
+        mesh: Watertight.
+        pieces: Most pieces.
+        vertices: Most vertices of a piece.
+    """
+    hull = mesh.convex_hull
+    if hull.volume < 1.05 * mesh.volume:
+        return [_with_few_vertices(hull, vertices)]
+    try:
+        import coacd
+    except ImportError:
+        _log.warning(
+            "collision shapes are whole convex hulls; `pip install 'splatart-ns[sim]'` brings coacd to take them apart"
+        )
+        return [_with_few_vertices(hull, vertices)]
+    coacd.set_log_level("error")
+    simple = _with_few_triangles(mesh)
+    found = coacd.run_coacd(
+        coacd.Mesh(simple.vertices, simple.faces),
+        threshold=_CONCAVITY,
+        max_convex_hull=pieces,
+        # Solid and without holes already, the mesh needs none of the voxels that it would be rebuilt from.
+        preprocess_mode="off" if simple.is_volume else "on",
+        # A shallow search takes a small part of the default's time and finds pieces nearly as tight.
+        resolution=200,
+        mcts_iterations=10,
+        mcts_nodes=6,
+        mcts_max_depth=1,
+        decimate=True,
+        max_ch_vertex=vertices,
+        seed=0,
+    )
+    hulls = [_hull_of(points) for points, _ in found]
+    return [piece for piece in hulls if piece is not None] or [_with_few_vertices(hull, vertices)]
+
+
+def _hull_of(points: np.ndarray) -> trimesh.Trimesh | None:
+    """The convex hull of points [N, 3]; None where they lie in a plane."""
+    try:
+        hull = trimesh.convex.convex_hull(points)
+    except Exception:  # Qhull's error has no public type of its own in scipy's older versions.
+        return None
+    return hull if hull.is_volume else None
+
+
+def _with_few_triangles(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A coarser mesh of the same solid, of _TRIANGLES or what 2 % of its size as tolerance leaves."""
+    size = float(mesh.extents.max())
+    solid = manifold3d.Manifold(manifold3d.Mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)))
+    if solid.is_empty():  # Not a manifold: CoACD mends it.
+        return mesh
+    tolerance = 0.003 * size
+    simple = solid.simplify(tolerance)
+    while simple.num_tri() > _TRIANGLES and tolerance < 0.02 * size:
+        tolerance *= 1.3
+        simple = solid.simplify(tolerance)
+    data = simple.to_mesh()
+    return trimesh.Trimesh(data.vert_properties[:, :3].astype(np.float64), data.tri_verts, process=False)
+
+
+def _with_few_vertices(hull: trimesh.Trimesh, vertices: int) -> trimesh.Trimesh:
+    """The hull of vertices of a convex mesh far apart from each other, so many at most."""
+    points = np.asarray(hull.vertices)
+    if len(points) <= vertices:
+        return hull
+    # Farthest point sampling, from the outermost vertex.
+    distance = np.linalg.norm(points - points.mean(0), axis=1)
+    chosen = [int(distance.argmax())]
+    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < vertices:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return trimesh.convex.convex_hull(points[chosen])

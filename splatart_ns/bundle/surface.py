@@ -1,0 +1,346 @@
+"""A closed mesh of a part from its Gaussians alone: depth seen from all around, fused in a signed distance field."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import manifold3d
+import numpy as np
+import torch
+import torch.nn.functional as F
+import trimesh
+from scipy import ndimage
+from skimage.measure import marching_cubes
+from torch import Tensor
+
+from splatart_ns.errors import InputError
+from splatart_ns.geometry.camera import project_points
+from splatart_ns.geometry.se3 import matrix_from_quat, transform_points
+from splatart_ns.rasterize import rasterization
+from splatart_ns.splats.splat import Splat
+
+_MIN_OPACITY = 0.02
+_VIEWS = 48
+_DISTANCE = 5.0
+"""From the cameras to the part's centre, in its radii: far enough to see into cavities, near enough for float32."""
+_SLICES = 16
+"""Layers of depth that are told apart along a ray."""
+_COARSE_PIXELS = 64
+"""Size of the images that find the part's extent."""
+_AGREEING = 3
+"""So many views must see through a place for it to be empty: fewer may be wrong."""
+_BAND = 3.0
+"""Truncation of the signed distance, voxels."""
+_THICKEN = 0.75
+"""What surfaces lie further out by in the field, voxels: a sheet that both sides see at one depth would have holes."""
+_LEFT_THICK = 0.25
+"""What of this the mesh keeps, voxels."""
+_COARSE = 4
+"""Voxels between the places where the field is looked at far from any surface."""
+_MIN_COMPONENT = 0.01
+"""Components of less than this share of the largest one's area are floaters."""
+
+
+@dataclass(frozen=True)
+class _DepthView:
+    """What one camera sees of the unit sphere."""
+
+    viewmat: Tensor
+    K: Tensor
+    image: Tensor
+    """Channels [5, H, W]: the accumulation, and times the accumulation: depth less _DISTANCE, colour."""
+
+    def sample(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Accumulation [N], how far behind each of `points` [N, 3] the seen surface lies [N], its colour [N, 3]."""
+        uv, z = project_points(points, self.viewmat, self.K)
+        at = (uv * (2 / self.image.shape[-1]) - 1)[None, None]
+        values = F.grid_sample(self.image[None], at, align_corners=False)[0, :, 0]
+        accumulation, rest = values[0], values[1:] / values[0].clamp_min(1e-6)
+        return accumulation, rest[0] - (z - _DISTANCE), rest[1:].T
+
+    def surface(self, least: float) -> Tensor:
+        """Where the pixels of at least this accumulation see the part [N, 3]."""
+        accumulation, depth = self.image[:2]
+        row, column = (accumulation > least).nonzero().unbind(-1)
+        z = depth[row, column] / accumulation[row, column] + _DISTANCE
+        ray = (torch.stack([column, row], -1) + 0.5 - self.K[:2, 2]) / self.K[0, 0]
+        return (F.pad(ray, (0, 1), value=1.0) * z[:, None] - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
+
+
+@torch.no_grad()
+def part_surface(splat: Splat, *, triangles: int = 20_000, voxels: int = 1_000_000) -> trimesh.Trimesh:
+    """A watertight mesh around the Gaussians of one part, in their frame and unit, with a colour per vertex.
+
+    The part alone is rendered from all around. Space that several views see through is empty; all else is solid: what
+    no view can look into is closed, and a sheet that both sides are seen of has some thickness. A part too small or too
+    transparent to hide what is behind it becomes the convex hull of its Gaussians. Deterministic.
+
+    Args:
+        splat: The Gaussians [N].
+        triangles: Most triangles of the mesh, 100 or more; flat shapes take fewer.
+        voxels: Number of voxels of the part's box. What is thinner than a voxel is not resolved.
+
+    Returns:
+        The mesh, wound outwards. `metadata["unseen_share"]` is the share of its area that no view looks at: where it
+        was closed.
+
+    Raises:
+        InputError: No Gaussian is visible, or they have no extent.
+    """
+    if triangles < 100:
+        raise InputError(f"a surface cannot be made of {triangles} triangles: ask for 100 or more")
+    splat = splat.detach().to("cpu", torch.float32)
+    splat = splat.select(splat.opacities > _MIN_OPACITY)
+    if len(splat) == 0:
+        raise InputError("a part has no visible Gaussians, and so no surface: fit the object again")
+    ends = _ellipsoid_ends(splat)
+    centre, half = _box(ends)
+    radius = float(half.norm())
+    if not (0 < radius < math.inf):
+        raise InputError("a part's Gaussians have no extent, and so it has no surface: fit the object again")
+
+    # Large faint Gaussians reach far beyond what can be seen: looks at less and less find the true box.
+    shrunk = True
+    while shrunk:
+        seen = torch.cat([view.surface(0.5) for view in _look_around(splat, centre, radius, _COARSE_PIXELS)])
+        if len(seen) == 0:
+            return _hull(splat, ends)
+        centre, half = _box(seen.double() * radius + centre)
+        half = half + 3 * radius / _COARSE_PIXELS
+        shrunk = float(half.norm()) < 0.5 * radius
+        radius = float(half.norm())
+    half = half.numpy() / radius
+
+    while True:
+        voxel = float((8 * half.prod() / voxels) ** (1 / 3))
+        views = _look_around(splat, centre, radius, math.ceil(2 / voxel))
+        level = _zero_level(views, half, voxel)
+        if level is None:
+            return _hull(splat, ends)
+        solid = _simplified(_without_floaters(*level), triangles, voxel)
+        if solid is not None:
+            break
+        voxels //= 4
+    mesh = _thinned(solid, (_THICKEN - _LEFT_THICK) * voxel)
+    colours, seen = _vertex_colours(views, torch.from_numpy(np.array(mesh.vertices)).float(), 2 * voxel)
+    mesh.visual.vertex_colors = colours
+    mesh.metadata["unseen_share"] = float(mesh.area_faces[~seen[mesh.faces].any(1)].sum() / mesh.area)
+    mesh.vertices = mesh.vertices * radius + centre.numpy()
+    return mesh
+
+
+def _box(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Centre and half sides [3] of the box around points [N, 3]."""
+    low, high = points.amin(0), points.amax(0)
+    return (low + high) / 2, (high - low) / 2
+
+
+def _ellipsoid_ends(splat: Splat) -> Tensor:
+    """Both ends of the Gaussians' axes at two standard deviations [6 N, 3], float64."""
+    axes = 2 * (matrix_from_quat(splat.quats.double()) * splat.scales.double()[:, None]).mT
+    means = splat.means.double()[:, None]
+    return torch.cat([means + axes, means - axes], 1).flatten(0, 1)
+
+
+def _hull(splat: Splat, ends: Tensor) -> trimesh.Trimesh:
+    """The convex hull of the Gaussians, with a thickness where they have none, in their mean colour."""
+    centre, half = _box(ends)
+    least = 1e-3 * float(half.max())
+    corners = torch.cartesian_prod(*[torch.tensor([-least, least], dtype=torch.float64)] * 3)
+    x = ((ends - centre)[:, None] + corners).flatten(0, 1).numpy()
+    mesh = trimesh.convex.convex_hull(np.unique(x, axis=0))
+    mesh.vertices = mesh.vertices + centre.numpy()
+    weights = splat.opacities[:, None]
+    colour = (weights * _base_colours(splat)).sum(0) / weights.sum()
+    mesh.visual.vertex_colors = _bytes(colour.expand(len(mesh.vertices), 3))
+    mesh.metadata["unseen_share"] = 1.0
+    return mesh
+
+
+def _look_around(splat: Splat, centre: Tensor, radius: float, pixels: int) -> list[_DepthView]:
+    """Views of the sphere about `centre` [3], made the unit sphere, `pixels` wide and high, from all around."""
+    unit = Splat(
+        means=((splat.means.double() - centre) / radius).float(),
+        quats=splat.quats,
+        # A Gaussian without any thickness has no slope.
+        log_scales=(splat.log_scales - math.log(radius)).clamp_min(math.log(1e-5)),
+        opacity_logits=splat.opacity_logits,
+        sh=splat.sh,
+    )
+    return [_look(unit, direction, pixels) for direction in _directions(_VIEWS)]
+
+
+def _directions(count: int) -> Tensor:
+    """Unit vectors [count, 3] spread evenly over the sphere (Fibonacci lattice)."""
+    k = torch.arange(count, dtype=torch.float64)
+    z = 1 - (2 * k + 1) / count
+    azimuth = k * math.pi * (3 - math.sqrt(5))
+    r = (1 - z * z).sqrt()
+    return torch.stack([r * azimuth.cos(), r * azimuth.sin(), z], -1)
+
+
+def _look(splat: Splat, direction: Tensor, pixels: int) -> _DepthView:
+    forward = -direction
+    side = torch.linalg.cross(forward, torch.eye(3, dtype=torch.float64)[int(forward.abs().argmin())])
+    side = side / side.norm()
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = torch.stack([side, torch.linalg.cross(forward, side), forward])
+    viewmat[2, 3] = _DISTANCE
+    viewmat = viewmat.float()
+    focal = pixels / 2 * math.sqrt(_DISTANCE**2 - 1)
+    K = torch.tensor([[focal, 0, pixels / 2], [0, focal, pixels / 2], [0, 0, 1]])
+
+    z = transform_points(viewmat, splat.means)[:, 2]
+    layer = ((z - z.min()) * (_SLICES / (z.max() - z.min()).clamp_min(1e-9))).long().clamp_max(_SLICES - 1)
+    planes = F.pad(_depth_planes(splat, viewmat, K), (1, 0), value=1.0)
+    image, accumulation, _ = rasterization(
+        *(splat.means, splat.quats, splat.scales, splat.opacities),
+        torch.cat([_base_colours(splat), (planes[:, :, None] * F.one_hot(layer, _SLICES)[:, None]).flatten(1)], 1),
+        *(viewmat[None], K[None], pixels, pixels),
+    )
+    weight, at_centre, along_x, along_y = image[0, ..., 3:].unflatten(-1, (4, _SLICES)).unbind(-2)
+    from_centre = torch.arange(pixels)[:, None] + 0.5 - pixels / 2
+    depth = _median_depth(weight, at_centre + along_x * from_centre + along_y * from_centre[:, None])
+    channels = torch.cat([accumulation[0], accumulation[0] * depth[..., None], image[0, ..., :3]], -1)
+    return _DepthView(viewmat, K, channels.permute(2, 0, 1).contiguous())
+
+
+def _base_colours(splat: Splat) -> Tensor:
+    """Colours [N, 3] without what depends on the view: for directions that no photograph shows that is a guess."""
+    return (0.5 + splat.sh[:, 0] / (2 * math.sqrt(math.pi))).clamp(0, 1)
+
+
+def _depth_planes(splat: Splat, viewmat: Tensor, K: Tensor) -> Tensor:
+    """The depth less _DISTANCE of each Gaussian as a plane over the image [N, 3]: at the centre, per pixel along x, y.
+
+    Where a ray meets a Gaussian most densely is linear in the pixel, for the local affine camera of EWA splatting
+    (Zwicker et al. 2001): the conditional mean of depth given the pixel. The centres' depths alone would make steps of
+    slanted surfaces. Composited like colours, the planes give the expected depth.
+    """
+    uv, z = project_points(splat.means, viewmat, K)
+    offset = uv - K[:2, 2]
+    J = torch.zeros(len(z), 3, 3)
+    J[:, 0, 0] = J[:, 1, 1] = K[0, 0] / z
+    J[:, :2, 2] = -offset / z[:, None]
+    J[:, 2, 2] = 1
+    half = J @ viewmat[:3, :3] @ matrix_from_quat(splat.quats) * splat.scales[:, None]
+    covariance = half @ half.mT
+    # The rasterizer's own blur, without which the slopes of Gaussians seen on edge have no bound.
+    seen = covariance[:, :2, :2] + 0.3 * torch.eye(2)
+    slope = torch.linalg.solve(seen, covariance[:, :2, 2])
+    return torch.cat([(z - _DISTANCE - (slope * offset).sum(-1))[:, None], slope], -1)
+
+
+def _median_depth(weight: Tensor, moment: Tensor) -> Tensor:
+    """Where half the opacity is passed [H, W], of each slice's sums of weights and of weight x depth [H, W, _SLICES].
+
+    The mean over the slice in which that is and its two neighbours. The mean over all slices would lie between front
+    and back wherever the front is not quite opaque.
+    """
+    weight, moment = (F.pad(x.cumsum(-1), (1, 0)) for x in (weight, moment))
+    middle = (weight[..., 1:] < 0.5 * weight[..., -1:]).sum(-1, keepdim=True).clamp_max(_SLICES - 1)
+    near, far = (middle - 1).clamp_min(0), (middle + 2).clamp_max(_SLICES)
+    inside = weight.gather(-1, far) - weight.gather(-1, near)
+    return ((moment.gather(-1, far) - moment.gather(-1, near)) / inside.clamp_min(1e-6))[..., 0]
+
+
+def _zero_level(views: list[_DepthView], half: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices and faces of the border between empty and solid in a box of half sides [3]; None where all is empty."""
+    # Whole coarse cells, with an empty margin.
+    cells = np.ceil(2 * half / (voxel * _COARSE)).astype(int) + 2
+    origin = -voxel * _COARSE * cells / 2
+    axes = [torch.from_numpy(origin[k] + voxel * np.arange(_COARSE * cells[k] + 1)).float() for k in range(3)]
+
+    def field_at(nodes: Tensor) -> np.ndarray:
+        points = torch.stack([axis[i] for axis, i in zip(axes, nodes.unbind(-1), strict=True)], -1)
+        return _field(views, points, voxel).numpy()
+
+    coarse_nodes = torch.cartesian_prod(*[torch.arange(0, len(axis), _COARSE) for axis in axes])
+    coarse = field_at(coarse_nodes).reshape(cells + 1)
+    near = np.zeros([len(axis) for axis in axes], bool)
+    for view in views:
+        nodes = np.round((view.surface(0.1).numpy() - origin) / voxel).astype(int)
+        near[tuple(nodes[((nodes >= 0) & (nodes < near.shape)).all(1)].T)] = True
+    near = ndimage.binary_dilation(near, iterations=3)
+    near |= _upsampled(ndimage.maximum_filter(coarse, 3) * ndimage.minimum_filter(coarse, 3) <= 0)
+    field = _upsampled(coarse)
+    field[near] = field_at(torch.from_numpy(np.argwhere(near)))
+    for axis in range(3):
+        np.moveaxis(field, axis, 0)[[0, -1]] = 1.0
+    if field.min() >= 0:
+        return None
+    # A node on the surface would make faces without area.
+    field[np.abs(field) < 1e-3] = 1e-3
+    vertices, faces, _, _ = marching_cubes(field, 0.0)
+    return origin + voxel * vertices, faces
+
+
+def _upsampled(values: np.ndarray) -> np.ndarray:
+    """Values at coarse nodes [I, J, K] for all nodes: each takes that of the nearest coarse one."""
+    for axis, size in enumerate(values.shape):
+        values = values.take((np.arange((size - 1) * _COARSE + 1) + _COARSE // 2) // _COARSE, axis)
+    return values
+
+
+def _field(views: list[_DepthView], points: Tensor, voxel: float) -> Tensor:
+    """Truncated signed distance [N] at `points` [N, 3], positive where empty: what _AGREEING views at least find.
+
+    The mean over views, the common choice, makes two-sided sheets as thick as the truncation, or loses them.
+    """
+    largest = torch.full((_AGREEING, len(points)), -1.0)
+    for view in views:
+        accumulation, behind, _ = view.sample(points)
+        value = (behind / voxel - _THICKEN).div_(_BAND).clamp_(-1, 1)
+        value = torch.maximum(value, 1 - 2 * accumulation)
+        for k in range(_AGREEING):
+            value, largest[k] = torch.minimum(largest[k], value), torch.maximum(largest[k], value)
+    return largest[-1]
+
+
+def _without_floaters(vertices: np.ndarray, faces: np.ndarray) -> manifold3d.Manifold:
+    """The large components of the solid, with the cavities filled that nothing leads into."""
+    solid = manifold3d.Manifold(manifold3d.Mesh(vertices.astype(np.float32), faces.astype(np.uint32)))
+    pieces = [piece for piece in solid.decompose() if piece.volume() > 0]
+    largest = max(piece.surface_area() for piece in pieces)
+    return manifold3d.Manifold.compose([p for p in pieces if p.surface_area() >= _MIN_COMPONENT * largest])
+
+
+def _simplified(solid: manifold3d.Manifold, triangles: int, voxel: float) -> manifold3d.Manifold | None:
+    """The solid with no more than so many triangles, moved by no more than two voxels; None where that cannot be."""
+    tolerance = 0.1 * voxel
+    while tolerance <= 2 * voxel:
+        simple = solid.simplify(tolerance)
+        if simple.num_tri() <= triangles:
+            return simple
+        tolerance *= 1.5
+    return None
+
+
+def _thinned(solid: manifold3d.Manifold, depth: float) -> trimesh.Trimesh:
+    """The solid's mesh with its surface moved inwards; as it is where all of it is sheets, which would turn over."""
+    data = solid.to_mesh()
+    mesh = trimesh.Trimesh(data.vert_properties[:, :3].astype(np.float64), data.tri_verts, process=False)
+    thin = mesh.copy()
+    thin.vertices -= depth * mesh.vertex_normals
+    return thin if thin.volume > 0.5 * mesh.volume else mesh
+
+
+def _vertex_colours(views: list[_DepthView], points: Tensor, band: float) -> tuple[np.ndarray, np.ndarray]:
+    """Colours [N, 4] uint8 that the views see within `band` of points [N, 3], and whether any view sees them [N]."""
+    total = torch.zeros(len(points), 4)
+    for view in views:
+        accumulation, behind, colour = view.sample(points)
+        weight = accumulation * ((behind.abs() < band) & (accumulation > 0.5))
+        total += weight[:, None] * F.pad(colour, (0, 1), value=1.0)
+    seen = total[:, 3] > 0
+    # What nobody saw takes the mean colour.
+    rgb = torch.where(
+        seen[:, None], total[:, :3] / total[:, 3:].clamp_min(1e-6), total[:, :3].sum(0) / total[:, 3].sum()
+    )
+    return _bytes(rgb), seen.numpy()
+
+
+def _bytes(rgb: Tensor) -> np.ndarray:
+    """RGBA [N, 4] uint8, opaque, of colours in 0..1 [N, 3]."""
+    return (255 * F.pad(rgb, (0, 1), value=1.0)).round().clamp(0, 255).to(torch.uint8).numpy()

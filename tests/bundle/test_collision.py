@@ -1,0 +1,52 @@
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+from splatart_ns.bundle.collision import convex_pieces
+
+
+def tray() -> trimesh.Trimesh:
+    """A box 1 x 0.6 x 0.4, open at the top, with walls 0.06 thick."""
+    hollow = trimesh.creation.box((0.88, 0.48, 0.4), transform=trimesh.transformations.translation_matrix([0, 0, 0.06]))
+    return trimesh.boolean.difference([trimesh.creation.box((1, 0.6, 0.4)), hollow])
+
+
+def test_a_convex_body_is_one_piece():
+    (piece,) = convex_pieces(trimesh.creation.box((1, 2, 3)))
+    assert piece.is_watertight
+    assert piece.volume == pytest.approx(6)
+
+
+def test_a_round_body_has_few_vertices():
+    (piece,) = convex_pieces(trimesh.creation.icosphere(4), vertices=32)
+    assert piece.is_convex and piece.is_watertight
+    assert len(piece.vertices) <= 32
+    assert piece.volume > 0.75 * 4 / 3 * np.pi
+
+
+def test_a_tray_stays_open():
+    pytest.importorskip("coacd")
+    pieces = convex_pieces(tray())
+    assert len(pieces) > 1
+    assert all(piece.is_watertight and piece.is_convex and len(piece.vertices) <= 32 for piece in pieces)
+    inside = np.array([[0, 0, 0.1], [0.3, 0.1, 0], [-0.3, -0.1, 0.05]])
+    assert not any(piece.contains(inside).any() for piece in pieces)
+    assert sum(piece.volume for piece in pieces) == pytest.approx(tray().volume, rel=0.3)
+
+
+def test_pieces_are_the_same_every_time():
+    pytest.importorskip("coacd")
+    upright = trimesh.creation.box((0.2, 0.5, 1), transform=trimesh.transformations.translation_matrix([-0.4, 0, 0.5]))
+    angle = trimesh.boolean.union([trimesh.creation.box((1, 0.5, 0.2)), upright])
+    first, second = convex_pieces(angle), convex_pieces(angle)
+    assert len(first) > 1
+    assert [p.vertices.tolist() for p in first] == [p.vertices.tolist() for p in second]
+
+
+def test_without_coacd_the_hull_stands_for_the_mesh(monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    (piece,) = convex_pieces(tray())
+    assert piece.volume == pytest.approx(0.24)
+    assert "coacd" in caplog.text

@@ -1,0 +1,155 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from splatart_ns.bundle.surface import part_surface
+from splatart_ns.errors import InputError
+from splatart_ns.geometry.se3 import quat_from_matrix
+from splatart_ns.splats.splat import Splat
+
+VOXELS = 60_000
+
+
+def splat_on(mesh: trimesh.Trimesh, n: int = 3000, opacity: float = 0.7) -> Splat:
+    """Flat Gaussians on a mesh; colour is green where x > 0, else red."""
+    points, face = trimesh.sample.sample_surface(mesh, n, seed=0)
+    z = mesh.face_normals[face]
+    x = np.cross(z, np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]]))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    sigma = math.sqrt(mesh.area / n)
+    rgb = np.where(points[:, :1] > 0, [[0.0, 1, 0]], [[1.0, 0, 0]])
+    return Splat(
+        means=torch.from_numpy(points).float(),
+        quats=quat_from_matrix(torch.from_numpy(np.stack([x, np.cross(z, x), z], -1))).float(),
+        log_scales=torch.tensor([sigma, sigma, 0.1 * sigma]).log().repeat(n, 1),
+        opacity_logits=torch.full((n,), math.log(opacity / (1 - opacity))),
+        sh=torch.from_numpy((rgb - 0.5) * 2 * math.sqrt(math.pi)).float()[:, None],
+    )
+
+
+def few(means: list[list[float]], scales=(0.1, 0.1, 0.1), opacity_logit: float = 3.0) -> Splat:
+    n = len(means)
+    return Splat(
+        means=torch.tensor(means),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        log_scales=torch.tensor(scales).log().repeat(n, 1),
+        opacity_logits=torch.full((n,), opacity_logit),
+        sh=torch.zeros(n, 1, 3),
+    )
+
+
+def assert_solid(mesh: trimesh.Trimesh) -> None:
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert mesh.volume > 0
+    assert np.isfinite(mesh.vertices).all()
+    assert mesh.visual.vertex_colors.shape == (len(mesh.vertices), 4)
+
+
+def distances(mesh: trimesh.Trimesh, true: trimesh.Trimesh) -> np.ndarray:
+    """From points on either surface to the other."""
+    a, b = (trimesh.sample.sample_surface(m, 1000, seed=1)[0] for m in (mesh, true))
+    to = trimesh.proximity.closest_point
+    return np.concatenate([to(true, a)[1], to(mesh, b)[1]])
+
+
+@pytest.mark.parametrize(
+    "true",
+    [
+        trimesh.creation.box((1, 0.6, 0.4)),
+        trimesh.creation.icosphere(3, 0.5),
+        trimesh.creation.torus(0.5, 0.15),
+        trimesh.creation.box((1, 0.3, 0.03)),
+    ],
+    ids=["box", "sphere", "torus", "plate"],
+)
+def test_a_closed_shape_is_found_again(true):
+    mesh = part_surface(splat_on(true), voxels=VOXELS)
+    assert_solid(mesh)
+    assert mesh.euler_number == true.euler_number
+    assert mesh.volume == pytest.approx(true.volume, rel=0.15)
+    assert np.sqrt((distances(mesh, true) ** 2).mean()) < 0.01
+
+
+def test_a_sheet_gets_a_thickness_and_stays_open():
+    box = trimesh.creation.box((1, 0.6, 0.4))
+    box.update_faces(box.face_normals[:, 2] < 0.5)
+    mesh = part_surface(splat_on(box, 5000), voxels=VOXELS)
+    assert_solid(mesh)
+    assert np.quantile(distances(mesh, box), 0.95) < 0.03
+    assert mesh.volume < 0.3 * 0.24
+
+
+def test_colours_lie_where_they_were():
+    mesh = part_surface(splat_on(trimesh.creation.box((1, 0.6, 0.4))), voxels=VOXELS)
+    red, green = mesh.visual.vertex_colors[:, 0].astype(int), mesh.visual.vertex_colors[:, 1].astype(int)
+    right = mesh.vertices[:, 0] > 0.1
+    left = mesh.vertices[:, 0] < -0.1
+    assert (green[right] > 200).mean() > 0.95 and (red[right] < 50).mean() > 0.95
+    assert (red[left] > 200).mean() > 0.95
+
+
+def test_the_budget_of_triangles_holds():
+    mesh = part_surface(splat_on(trimesh.creation.torus(0.5, 0.15)), triangles=800, voxels=VOXELS)
+    assert_solid(mesh)
+    assert 200 < len(mesh.faces) <= 800
+
+
+def test_place_and_size_do_not_matter():
+    box = trimesh.creation.box((1, 0.6, 0.4))
+    near = part_surface(splat_on(box), voxels=VOXELS)
+    splat = splat_on(box)
+    splat.means = 0.01 * splat.means + torch.tensor([3.0, -2, 1])
+    splat.log_scales = splat.log_scales + math.log(0.01)
+    far = part_surface(splat, voxels=VOXELS)
+    assert far.volume == pytest.approx(1e-6 * near.volume, rel=0.02)
+    np.testing.assert_allclose(far.bounds, 0.01 * near.bounds + [3.0, -2, 1], atol=1e-4)
+
+
+def test_the_same_every_time():
+    splat = splat_on(trimesh.creation.box((1, 0.6, 0.4)), 500)
+    first, second = (part_surface(splat, voxels=VOXELS) for _ in range(2))
+    assert np.array_equal(first.vertices, second.vertices) and np.array_equal(first.faces, second.faces)
+
+
+def test_a_faint_far_gaussian_changes_nothing():
+    box = trimesh.creation.box((1, 0.6, 0.4))
+    faint = few([[8.0, 0, 0]], (3.0, 3.0, 3.0), opacity_logit=-2.0)
+    mesh = part_surface(Splat.cat([splat_on(box), faint]), voxels=VOXELS)
+    assert mesh.volume == pytest.approx(0.24, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    "splat",
+    [
+        few([[1.0, 2, 3]]),
+        few([[1.0, 2, 3]], opacity_logit=-1.0),
+        few([[1.0, 2, 3]], (0.1, 1e-12, 1e-12)),
+        few([[1e4, 0, 0]], (1e-3, 1e-3, 1e-3)),
+        few([[0.0, 0, 0], [0.0, 0, 0]]),
+        few([[0.1 * k, 0, 0] for k in range(9)], (0.05, 1e-6, 1e-6)),
+        few([[0.1 * k, 0.1 * j, 0] for k in range(5) for j in range(5)], (0.1, 0.1, 0.0)),
+        few([[0.0, 0, 0], [100.0, 0, 0]]),
+    ],
+    ids=["one", "faint", "needle", "far", "twice", "line", "plane", "apart"],
+)
+def test_few_gaussians_still_make_a_solid(splat):
+    mesh = part_surface(splat, voxels=VOXELS)
+    assert_solid(mesh)
+    low, high = splat.means.amin(0).numpy() - 1, splat.means.amax(0).numpy() + 1
+    assert (mesh.vertices > low).all() and (mesh.vertices < high).all()
+
+
+@pytest.mark.parametrize(
+    "splat", [few([[0.0, 0, 0]]).select(torch.tensor([], dtype=torch.long)), few([[0.0, 0, 0]], opacity_logit=-9)]
+)
+def test_nothing_visible_is_an_error(splat):
+    with pytest.raises(InputError, match="no visible Gaussians"):
+        part_surface(splat)
+
+
+def test_no_extent_is_an_error():
+    with pytest.raises(InputError, match="no extent"):
+        part_surface(few([[0.0, 0, 0]], (0.0, 0.0, 0.0)))
