@@ -149,6 +149,64 @@ def evaluate(bundle: Annotated[Path, tyro.conf.Positional], data: Path, rasteriz
         CONSOLE.print(table)
 
 
+def export(
+    bundle: Annotated[Path, tyro.conf.Positional],
+    format: tuple[Literal["urdf", "mjcf", "usd", "glb", "ply"], ...],
+    output: Path | None = None,
+    scale: float | None = None,
+    density: float = 400.0,
+    limit_margin: float = 0.05,
+    validate: bool = True,
+) -> None:
+    """Write a bundle for robot simulators, viewers and 3D programs, and open it there to check it; no GPU is needed.
+
+    Args:
+        bundle: Folder that `splatart fit` left.
+        format: One or more: urdf, mjcf (MuJoCo), usd (UsdPhysics), glb (a node a part, animated), ply (all Gaussians).
+        output: Folder of the export; with several formats each has its folder in it. By default BUNDLE/export/FORMAT.
+        scale: Metres per unit of the bundle; by default what its unit says, or 1 where it is unknown.
+        density: Of the parts, filled, in kg / m^3.
+        limit_margin: How much wider than the observed range joint limits are at both ends, as a share of the range.
+        validate: Load what was written in the programs that read it and compare the poses of all links.
+    """
+    from splatart_ns.bundle import export as exports
+    from splatart_ns.bundle import load_bundle
+
+    for name, number in {"scale": scale, "density": density}.items():
+        if number is not None and not 0 < number < math.inf:
+            raise InputError(f"--{name} is {number}; give a number above 0.")
+    if not 0 <= limit_margin < math.inf:
+        raise InputError(f"--limit-margin is {limit_margin}; give a number of 0 or more.")
+    formats = tuple(dict.fromkeys(format))
+    if not formats:
+        raise InputError("--format is empty; give one or more of urdf, mjcf, usd, glb, ply.")
+    # What cannot be written is said before the meshes are made.
+    exports.require(formats)
+    folders = {form: bundle / "export" / form if output is None else output for form in formats}
+    if output is not None and len(formats) > 1:
+        folders = {form: output / form for form in formats}
+    for folder in folders.values():
+        exports.check_folder(folder)
+    loaded = load_bundle(bundle)
+    with CONSOLE.status(f"Meshes of {len(loaded.parts)} parts ..."):
+        shapes = exports.part_shapes(loaded) if formats != ("ply",) else None
+    robot = exports.describe(loaded, shapes, bundle.resolve().name, scale, density, limit_margin)
+    for note in robot.notes:
+        CONSOLE.print(f"note: {note}", markup=False)
+    failed = False
+    for form, folder in folders.items():
+        path = exports.export(loaded, robot, form, folder)
+        CONSOLE.print(f"Export: {path}", soft_wrap=True)
+        for note in exports.format_notes(robot, form):
+            CONSOLE.print(f"note: {note}", markup=False)
+        if validate:
+            checks = exports.validate(path, form, loaded, robot)
+            failed |= any(check.verdict == "failed" for check in checks)
+            CONSOLE.print(exports.format_checks(checks))
+    if failed:
+        raise SystemExit(1)
+
+
 def check(capture: Annotated[Path, tyro.conf.Positional]) -> None:
     """Say what is wrong with a capture, frame by frame, and how to mend it.
 
@@ -232,7 +290,15 @@ def main() -> None:
     # Nerfstudio's own, which its users cannot mend.
     warnings.filterwarnings("ignore", category=FutureWarning)
     warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True")
-    commands = {"fit": fit, "render": render, "eval": evaluate, "check": check, "synth": synth, "demo": demo}
+    commands = {
+        "fit": fit,
+        "render": render,
+        "eval": evaluate,
+        "check": check,
+        "export": export,
+        "synth": synth,
+        "demo": demo,
+    }
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="splatart", description=__doc__)
     except InputError as error:

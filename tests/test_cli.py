@@ -54,7 +54,7 @@ def test_help_names_every_command(start_splatart):
     process = start_splatart("--help")
     output, errors = process.communicate()
     assert (process.returncode, errors) == (0, "")
-    assert all(f"• {command} " in output for command in ("fit", "render", "eval", "check", "synth", "demo"))
+    assert all(f"• {command} " in output for command in ("fit", "render", "eval", "check", "export", "synth", "demo"))
 
 
 def test_check_has_nothing_to_say_about_a_sound_capture(run_main, hinge_capture):
@@ -71,6 +71,13 @@ def test_check_tells_all_problems(run_main, hinge_capture, tmp_path):
     assert first.startswith(f"error: {capture / 'state_00/images/0001.png'}: the file does not exist; ")
     assert second.startswith(f"error: {capture / 'state_01/images/0004.png'}: ")
     assert last == "2 errors, 0 warnings"
+
+
+def test_a_fitted_bundle_moves_in_a_simulator(run_main, hinge_fit, tmp_path):
+    pytest.importorskip("mujoco", reason="mujoco is not installed: extra 'sim'")
+    code, output, _ = run_main("export", hinge_fit, "--format", "mjcf", "--output", tmp_path / "robot")
+    assert code == 0 and "10 s under gravity" in output
+    assert (tmp_path / "robot" / f"{hinge_fit.name}.xml").is_file()
 
 
 def test_eval_writes_all_metrics(run_main, bundle, hinge_capture):

@@ -30,8 +30,11 @@ _TYPES = {
 }  # fmt: skip
 
 
-def write_ply(splat: Splat, path: Path) -> None:
-    """Write a splat, part logits left out. A value that is not finite raises ValueError."""
+def write_ply(splat: Splat, path: Path, parts: torch.Tensor | None = None) -> None:
+    """Write a splat, part logits left out. A value that is not finite raises ValueError.
+
+    `parts` [N], ids of 0 to 255, become the last property, `uchar part`.
+    """
     n = len(splat)
     rest = splat.sh[:, 1:].transpose(1, 2).flatten(1)
     names = [*_CENTRE, "nx", "ny", "nz", *_COLOUR, *(f"f_rest_{i}" for i in range(rest.shape[1]))]
@@ -42,12 +45,16 @@ def write_ply(splat: Splat, path: Path) -> None:
     if not np.isfinite(table).all():
         raise ValueError(f"{path}: a splat to be written has values that are not finite")
 
-    vertices = np.ascontiguousarray(table, "<f4").view([(name, "<f4") for name in names])
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
-    header += [*(f"property float {name}" for name in names), "end_header"]
+    header += [f"property float {name}" for name in names]
+    rows = np.ascontiguousarray(table, "<f4").view("u1").reshape(n, 4 * len(names))
+    if parts is not None:
+        header.append("property uchar part")
+        rows = np.column_stack([rows, parts.to("cpu", torch.uint8).numpy()])
+    header.append("end_header")
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
-        file.write(vertices.tobytes())
+        file.write(rows.tobytes())
 
 
 def read_ply(path: Path) -> Splat:
@@ -56,6 +63,8 @@ def read_ply(path: Path) -> Splat:
     Raises InputError for anything that is not a whole, finite 3DGS PLY. Properties of other names are skipped.
     """
     path = Path(path)
+    if path.exists() and not path.is_file():  # a pipe would never end
+        raise InputError(f"{path}: is not a file; give a PLY file")
     try:
         with path.open("rb") as file:
             count, dtype = _read_header(file, path)

@@ -62,6 +62,16 @@ def test_the_file_has_the_layout_that_viewers_expect(tmp_path):
     assert np.array_equal(table[:, names.index("rot_0")], splat.quats[:, 0].numpy())
 
 
+def test_part_ids_are_a_property_of_their_own(tmp_path):
+    splat = random_splat(3, 0)
+    write_ply(splat, tmp_path / "whole.ply", parts=torch.tensor([1, 254, 2]))
+    data = (tmp_path / "whole.ply").read_bytes()
+    assert b"property float rot_3\nproperty uchar part\nend_header\n" in data
+    size = len(data.split(b"end_header\n", 1)[1]) // 3
+    assert [data[-1 - 2 * size], data[-1 - size], data[-1]] == [1, 254, 2]
+    torch.testing.assert_close(read_ply(tmp_path / "whole.ply").means, splat.means, atol=0, rtol=0)
+
+
 def test_writing_leaves_no_other_file(tmp_path):
     write_ply(random_splat(2, 0), tmp_path / "a.ply")
     assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]

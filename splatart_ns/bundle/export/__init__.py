@@ -1,0 +1,25 @@
+"""The result as files that robot simulators, viewers and 3D programs open, checked by those programs."""
+
+from splatart_ns.bundle.export.describe import DENSITY, LIMIT_MARGIN, describe
+from splatart_ns.bundle.export.folder import check_folder
+from splatart_ns.bundle.export.formats import Format, export, format_notes, require
+from splatart_ns.bundle.export.robot import Robot
+from splatart_ns.bundle.export.shapes import PartShape, part_shapes
+from splatart_ns.bundle.export.validation import Check, format_checks, validate
+
+__all__ = [
+    "DENSITY",
+    "LIMIT_MARGIN",
+    "Check",
+    "Format",
+    "PartShape",
+    "Robot",
+    "check_folder",
+    "describe",
+    "export",
+    "format_checks",
+    "format_notes",
+    "part_shapes",
+    "require",
+    "validate",
+]

@@ -1,0 +1,84 @@
+"""An exported MJCF run in MuJoCo."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+SECONDS = 10.0
+"""The least simulated time."""
+_SECONDS_A_JOINT = 2.0
+_FASTEST = 100.0  # radian or metre per second: beyond, something exploded
+
+
+@dataclass(frozen=True)
+class Run:
+    """What happened while every joint was driven across its range in turn, under gravity."""
+
+    seconds: float
+    """Simulated."""
+    stable: bool
+    """No value that is not finite, no warning of MuJoCo, no speed of an explosion."""
+    excess: float
+    """The most that a joint went beyond its limits, as a share of its range."""
+    reached: float
+    """The least share of its range that a joint covered while it was driven."""
+    slowest: str
+    """That joint; empty if there is none."""
+    at_rest: frozenset[tuple[str, str]]
+    """Pairs of bodies in contact in the first state."""
+    touched: frozenset[tuple[str, str]]
+    """Pairs of bodies in contact at any time."""
+
+
+def simulate(path: Path) -> Run:
+    """Drive the file's own actuators, one after the other, to the upper limit, to the lower, and back."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    at_rest = touched = _contacts(model, data)
+    seconds = max(SECONDS, _SECONDS_A_JOINT * model.nu)
+    steps = round(seconds / model.opt.timestep)
+    limited = np.flatnonzero(model.jnt_limited)
+    low, high = model.jnt_range[limited].T
+    driven_low, driven_high = np.full(model.nu, np.inf), np.full(model.nu, -np.inf)
+    stable, excess = True, 0.0
+    for step in range(steps):
+        data.ctrl[:] = 0.0
+        turn, phase = divmod(step * model.nu / steps, 1.0) if model.nu else (0, 0.0)
+        actuator = int(turn)
+        if model.nu:
+            data.ctrl[actuator] = _across(phase, *model.actuator_ctrlrange[actuator])
+        mujoco.mj_step(model, data)
+        stable &= bool(np.isfinite(data.qpos).all() and np.isfinite(data.qacc).all())
+        stable &= bool(np.abs(data.qvel).max(initial=0.0) < _FASTEST)
+        if not stable:
+            break
+        if data.ncon:
+            touched |= _contacts(model, data)
+        q = data.qpos[limited]  # all joints are of one number
+        excess = max(excess, float((np.maximum(q - high, low - q) / (high - low)).max(initial=0.0)))
+        if model.nu:
+            q = data.qpos[model.actuator_trnid[actuator, 0]]
+            driven_low[actuator] = min(driven_low[actuator], q)
+            driven_high[actuator] = max(driven_high[actuator], q)
+    stable &= not any(warning.number for warning in data.warning)
+    covered = (driven_high - driven_low) / np.ptp(model.jnt_range[model.actuator_trnid[:, 0]], axis=1)
+    slowest = model.actuator(int(covered.argmin())).name if model.nu else ""
+    return Run(seconds, stable, excess, float(covered.min(initial=1.0)), slowest, at_rest, touched)
+
+
+def _across(phase: float, low: float, high: float) -> float:
+    """From 0 to the upper limit, to the lower one and back, like a cosine, as the phase goes from 0 to 1."""
+    start = math.acos(min(max((high + low) / (high - low), -1.0), 1.0))
+    return low + (high - low) * (1 - math.cos(start + 2 * math.pi * phase)) / 2
+
+
+def _contacts(model, data) -> frozenset[tuple[str, str]]:
+    bodies = (sorted(model.body(model.geom_bodyid[geom]).name for geom in contact.geom) for contact in data.contact)
+    return frozenset((a, b) for a, b in bodies)

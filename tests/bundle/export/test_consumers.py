@@ -1,0 +1,206 @@
+"""What is written is read by other programs, and every link is where the bundle says."""
+
+import dataclasses
+import json
+import logging
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from splatart_ns.bundle import JOINT_DOFS
+from splatart_ns.bundle.export import PartShape, describe, export, validate
+from splatart_ns.bundle.export.names import identifier
+from splatart_ns.bundle.export.simulation import simulate
+
+FORMATS = ["urdf", "mjcf", "usd", "glb", "ply"]
+NEEDS = {"mjcf": "mujoco", "usd": "pxr"}
+
+
+@pytest.fixture(params=FORMATS)
+def form(request):
+    if request.param in NEEDS:
+        pytest.importorskip(NEEDS[request.param], reason=f"{NEEDS[request.param]} is not installed: extra 'sim'")
+    return request.param
+
+
+def report(checks):
+    return {(c.program, c.what): (c.verdict, c.found) for c in checks}
+
+
+def assert_good(checks):
+    assert checks and not [c for c in checks if c.verdict == "failed"], report(checks)
+
+
+def test_every_joint_type_in_one_chain_and_branches(objects, tmp_path, form):
+    bundle = objects.chain([kind for kind in JOINT_DOFS if kind != "free"])
+    for i, (kind, parent) in enumerate([("free", "p0"), ("revolute", "p2"), ("prismatic", "p2")], start=7):
+        bundle.parts.append(objects.make_bundle([f"p{k}" for k in range(i + 1)], []).parts[i])
+        bundle.joints.append(objects.joint(f"j{i}", kind, parent, f"p{i}", i))
+    robot = objects.robot(bundle, scale=0.5)
+    assert_good(validate(export(bundle, robot, form, tmp_path / "out"), form, bundle, robot))
+
+
+def test_names_of_people(objects, tmp_path, form):
+    names = ["base/plate", "base plate", "Türe <1>", "2", "joints", "柜", "world"]
+    joints = [
+        objects.joint(f"{a} → {b}", "revolute", a, b, i + 1)
+        for i, (a, b) in enumerate(zip(names, names[1:], strict=False))
+    ]
+    bundle = objects.make_bundle(names, joints)
+    robot = describe(bundle, objects.shapes(bundle), "my thing (1)")
+    path = export(bundle, robot, form, tmp_path / "ä folder")
+    assert path.stem == identifier("my thing (1)")
+    assert_good([c for c in validate(path, form, bundle, robot) if "gravity" not in c.what])
+
+
+def test_tiny_flat_and_empty_parts(objects, tmp_path, form):
+    import trimesh
+
+    bundle = objects.chain(["revolute", "prismatic", "revolute", "fixed"])
+    shapes = objects.shapes(bundle)
+    speck = trimesh.creation.box([1e-4] * 3).apply_translation([0.7, 0.2, 0.1])
+    foil = trimesh.creation.box([0.3, 0.3, 1e-5]).apply_translation([1.4, 0.4, 0.2])
+    shapes |= {"p1": PartShape(speck, (speck,)), "p2": PartShape(foil, (foil,)), "p3": PartShape(None, ())}
+    robot = describe(bundle, shapes, "thing")
+    assert_good(validate(export(bundle, robot, form, tmp_path / "out"), form, bundle, robot))
+
+
+def test_one_part_alone(objects, tmp_path, form):
+    bundle = objects.make_bundle(["stone"], [])
+    robot = objects.robot(bundle)
+    assert_good(validate(export(bundle, robot, form, tmp_path / "out"), form, bundle, robot))
+
+
+@pytest.mark.parametrize("form", ["urdf", "mjcf", "usd"])
+def test_loops_are_written_or_noted(objects, tmp_path, form):
+    if form in NEEDS:
+        pytest.importorskip(NEEDS[form])
+    bundle = objects.chain(["revolute", "revolute"])
+    bundle.joints += [objects.joint(f"{kind} closure", kind, "p2", "p0", 1, in_tree=False) for kind in JOINT_DOFS]
+    robot = objects.robot(bundle)
+    path = export(bundle, robot, form, tmp_path / "out")
+    notes = " ".join(json.loads((path.parent / "export.json").read_text())["notes"])
+    left_out = {kind for kind in JOINT_DOFS if f"Joint '{kind}_closure' closes a loop" in notes}
+    if form == "usd":
+        stage = pytest.importorskip("pxr.Usd").Stage.Open(str(path))
+        written = {k for k in JOINT_DOFS if stage.GetPrimAtPath(f"/thing/joints/{k}_closure").IsValid()}
+    else:
+        written = {k for k in JOINT_DOFS if f'"{k}_closure"' in path.read_text()}
+    assert left_out == (set(JOINT_DOFS) if form == "urdf" else {"free"})
+    assert written == set(JOINT_DOFS) - left_out
+    assert_good([c for c in validate(path, form, bundle, robot) if "gravity" not in c.what])
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic", "screw", "cylindrical", "spherical"])
+def test_a_loop_allows_what_its_joint_allows(objects, tmp_path, kind):
+    """The same joint twice between the same parts, once in the tree and once as a loop."""
+    pytest.importorskip("mujoco")
+    bundle = objects.chain([kind])
+    bundle.joints.append(objects.joint("again", kind, "p0", "p1", 1, in_tree=False))
+    robot = objects.robot(bundle)
+    run = simulate(export(bundle, robot, "mjcf", tmp_path / "out"))
+    assert run.stable and run.excess < 0.01 and run.reached > 0.9
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_a_loop_forbids_what_its_joint_forbids(objects, tmp_path, kind):
+    """A part that turns and slides, but is in a loop that allows one of the two."""
+    mujoco = pytest.importorskip("mujoco")
+    bundle = objects.chain(["cylindrical"])
+    bundle.joints.append(objects.joint("again", kind, "p0", "p1", 1, in_tree=False))
+    robot = objects.robot(bundle)
+    model = mujoco.MjModel.from_xml_path(str(export(bundle, robot, "mjcf", tmp_path / "out")))
+    data = mujoco.MjData(model)
+    for _ in range(1000):
+        data.ctrl[:] = [0.1, 0.5]
+        mujoco.mj_step(model, data)
+    slide, turn = (float(data.joint(f"j1_{name}").qpos[0]) for name in ("slide", "turn"))
+    if kind == "revolute":
+        assert abs(slide) < 0.01 and turn == pytest.approx(0.5, abs=0.05)
+    else:
+        assert abs(turn) < 0.05 and slide == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_loop_that_closes_is_simulated(objects, tmp_path):
+    """Two links side by side with the same hinge, and welded to each other: they turn together."""
+    mujoco = pytest.importorskip("mujoco")
+    names = ["base", "left", "right"]
+    joints = [objects.joint(f"to {name}", "revolute", "base", name, 1) for name in names[1:]]
+    joints.append(objects.joint("weld", "fixed", "left", "right", 1, in_tree=False))
+    bundle = objects.make_bundle(names, joints)
+    robot = objects.robot(bundle)
+    path = export(bundle, robot, "mjcf", tmp_path / "out")
+    assert_good(validate(path, "mjcf", bundle, robot))
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    for _ in range(1000):
+        data.ctrl[:] = 0.8
+        mujoco.mj_step(model, data)
+    assert data.qpos[0] == pytest.approx(data.qpos[1], abs=0.02)
+    assert data.qpos[0] == pytest.approx(0.8, abs=0.05)
+
+
+@pytest.mark.parametrize("form", ["urdf", "glb", "ply"])
+def test_a_wrong_file_fails(objects, tmp_path, form):
+    bundle = objects.chain(["revolute", "prismatic"])
+    robot = objects.robot(bundle)
+    path = export(bundle, robot, form, tmp_path / "out")
+    other = objects.chain(["revolute", "prismatic"])
+    other.joints[0].axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    other.parts[1].splat.means += 1.0
+    checks = validate(path, form, other, robot)
+    assert any(c.verdict == "failed" for c in checks), report(checks)
+
+
+@pytest.mark.parametrize("form", ["urdf", "mjcf", "usd", "glb", "ply"])
+def test_a_damaged_file_fails_without_a_traceback(objects, tmp_path, form):
+    bundle = objects.chain(["revolute"])
+    robot = objects.robot(bundle)
+    if form in NEEDS:
+        pytest.importorskip(NEEDS[form])
+    path = export(bundle, robot, form, tmp_path / "out")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    checks = validate(path, form, bundle, robot)
+    assert any(c.verdict == "failed" for c in checks), report(checks)
+
+
+def test_a_warning_of_a_program_fails(objects, tmp_path, monkeypatch):
+    from splatart_ns.bundle.export import validation as module
+
+    class Loud:
+        def __init__(self, path, robot):
+            logging.getLogger("loud").warning("no mesh for you")
+            warnings.warn("nor here", stacklevel=1)
+
+        def poses(self, values):
+            return {"p0": np.eye(4), "p1": np.eye(4)}
+
+    bundle = objects.chain(["fixed"])
+    robot = objects.robot(bundle)
+    monkeypatch.setitem(module._CONSUMERS, "urdf", (("loud", Loud),))
+    checks = validate(tmp_path / "x.urdf", "urdf", bundle, robot)
+    assert {c.found for c in checks if c.verdict == "failed"} >= {"no mesh for you", "nor here"}
+
+
+def test_a_program_that_is_not_installed_is_said_to_be(objects, tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    bundle = objects.chain(["revolute"])
+    robot = objects.robot(bundle)
+    found = report(validate(export(bundle, robot, "mjcf", tmp_path / "out"), "mjcf", bundle, robot))
+    assert found["mujoco", "link poses"] == ("not checked", "pip install mujoco")
+    assert not [v for v, _ in found.values() if v in ("failed", "passed")]
+
+
+def test_pose_errors_are_relative_to_the_object(objects, tmp_path):
+    bundle = objects.chain(["revolute"])
+    robot = objects.robot(bundle, scale=1e-3)
+    path = export(bundle, robot, "glb", tmp_path / "out")
+    moved = dataclasses.replace(robot, links=dict(robot.links))
+    link = robot.links["p1"]
+    moved.links["p1"] = dataclasses.replace(link, origin=link.origin + 1e-7)
+    found = report(validate(path, "glb", bundle, moved))
+    assert found["trimesh", "link poses"][0] == "failed"

@@ -1,0 +1,174 @@
+"""What is in the files, beyond what their readers check."""
+
+import importlib.util
+import json
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+import trimesh
+import yourdfpy
+
+from splatart_ns.bundle.export import export, require
+from splatart_ns.bundle.export.colour import linear_from_srgb
+from splatart_ns.errors import InputError
+from splatart_ns.splats.ply import read_ply
+
+
+@pytest.fixture
+def write(objects, tmp_path):
+    def write(form, kinds=("revolute", "screw"), **changes):
+        bundle = objects.chain(list(kinds))
+        return export(bundle, objects.robot(bundle, **changes), form, tmp_path / "out")
+
+    return write
+
+
+def glb_tree(path):
+    data = path.read_bytes()
+    return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+
+
+def test_a_urdf_has_all_that_simulators_ask_for(write):
+    root = ElementTree.parse(write("urdf")).getroot()
+    for link in root.findall("link"):
+        assert float(link.find("inertial/mass").get("value")) > 0
+    for link in ("p0", "p1", "p2"):
+        assert root.find(f"link[@name='{link}']/visual") is not None
+        assert root.find(f"link[@name='{link}']/collision") is not None
+    moving = [joint for joint in root.findall("joint") if joint.get("type") != "fixed"]
+    assert [joint.get("name") for joint in moving] == ["j1", "j2_turn", "j2_slide"]
+    for joint in moving:
+        assert {*joint.find("limit").attrib} == {"lower", "upper", "effort", "velocity"}
+        assert {*joint.find("dynamics").attrib} == {"damping", "friction"}
+        axis = np.array(joint.find("axis").get("xyz").split(), float)
+        assert np.linalg.norm(axis) == pytest.approx(1, abs=1e-12)
+    mimic = root.find("joint[@name='j2_slide']/mimic")
+    assert mimic.get("joint") == "j2_turn" and float(mimic.get("multiplier")) == pytest.approx(0.03)
+
+
+def test_mesh_files_are_beside_the_description_and_in_the_links_frame(objects, write):
+    path = write("urdf", scale=0.5)
+    mesh = trimesh.load(path.parent / "meshes" / "p1_visual.obj")
+    joint = objects.chain(["revolute", "screw"]).joints[0]
+    np.testing.assert_allclose(mesh.bounds.mean(0), 0.5 * (np.array([0.7, 0.2, 0.1]) - joint.origin.numpy()), atol=1e-6)
+    np.testing.assert_array_equal(mesh.visual.vertex_colors[0], [200, 20, 40, 255])
+    names = [p.relative_to(path.parent).as_posix() for p in path.parent.rglob("*.obj")]
+    listed = json.loads((path.parent / "export.json").read_text())["files"]
+    assert set(names) | {path.name} == set(listed)
+
+
+def test_an_mjcf_keeps_neighbours_from_colliding_and_drives_what_has_a_value_of_its_own(write):
+    root = ElementTree.parse(write("mjcf")).getroot()
+    assert [(e.get("body1"), e.get("body2")) for e in root.findall("contact/exclude")] == [("p0", "p1"), ("p1", "p2")]
+    assert [a.get("joint") for a in root.findall("actuator/position")] == ["j1", "j2_turn"]
+    (screw,) = root.findall("equality/joint")
+    assert (screw.get("joint1"), screw.get("joint2")) == ("j2_slide", "j2_turn")
+    assert len(root.findall(".//body")) == 3
+
+
+def test_a_usd_is_an_articulation_fixed_to_the_world(write):
+    pxr = pytest.importorskip("pxr.UsdPhysics")
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(write("usd")))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    root = stage.GetPrimAtPath("/thing/joints/world")
+    assert root.HasAPI(pxr.ArticulationRootAPI) and root.IsA(pxr.FixedJoint)
+    assert [str(p) for p in pxr.Joint(root).GetBody1Rel().GetTargets()] == ["/thing/p0"]
+    hinge = pxr.RevoluteJoint(stage.GetPrimAtPath("/thing/joints/j1"))
+    assert hinge.GetUpperLimitAttr().Get() == pytest.approx(np.degrees(1.26))
+    piece = stage.GetPrimAtPath("/thing/p1/collision_0")
+    assert piece.HasAPI(pxr.CollisionAPI) and pxr.MeshCollisionAPI(piece).GetApproximationAttr().Get() == "convexHull"
+
+
+def test_a_glb_has_a_node_per_part_and_says_how_it_moves(write):
+    tree = glb_tree(write("glb"))
+    nodes = {node["name"]: node for node in tree["nodes"]}
+    children = {node["name"]: [tree["nodes"][i]["name"] for i in node.get("children", [])] for node in tree["nodes"]}
+    assert children == {"z_up": ["p0"], "p0": ["p1"], "p1": ["p2"], "p2": []}
+    assert nodes["p1"]["extras"]["freedoms"][0]["type"] == "revolute"
+    assert nodes["p2"]["extras"]["freedoms"][1]["follows"] == {"name": "j2_turn", "factor": pytest.approx(0.03)}
+    (sweep,) = tree["animations"]
+    moved = {(tree["nodes"][c["target"]["node"]]["name"], c["target"]["path"]) for c in sweep["channels"]}
+    assert moved == {("p1", "rotation"), ("p2", "rotation"), ("p2", "translation")}
+    # glTF is y up: what was up in the capture is up there.
+    up = np.array(nodes["z_up"]["matrix"]).reshape(4, 4).T @ [0, 0, 1, 0]
+    np.testing.assert_allclose(up, [0, 1, 0, 0], atol=1e-12)
+
+
+def test_colours_in_a_glb_are_of_light(write):
+    path = write("glb")
+    tree, data = glb_tree(path), path.read_bytes()
+    primitive = next(mesh for mesh in tree["meshes"] if mesh["name"] == "p1_surface")["primitives"][0]
+    view = tree["bufferViews"][tree["accessors"][primitive["attributes"]["COLOR_0"]]["bufferView"]]
+    start = 28 + int.from_bytes(data[12:16], "little") + view["byteOffset"]
+    colour = np.frombuffer(data, "u1", 3, start) / 255
+    np.testing.assert_allclose(colour, linear_from_srgb(np.array([200, 20, 40]) / 255), atol=0.5 / 255)
+
+
+def test_srgb_at_its_known_points():
+    np.testing.assert_allclose(linear_from_srgb(np.array([0.0, 0.5, 1.0])), [0, 0.21404, 1], atol=1e-5)
+
+
+def test_the_whole_ply_has_all_gaussians_in_metres(objects, write):
+    bundle = objects.chain(["revolute", "screw"])
+    splat = read_ply(write("ply", scale=0.5))
+    for i, part in enumerate(bundle.parts):
+        own = splat.select(np.arange(6) + 6 * i)
+        np.testing.assert_allclose(own.means, 0.5 * part.splat.means, atol=1e-6)
+        np.testing.assert_allclose(own.scales, 0.5 * part.splat.scales, rtol=1e-5)
+
+
+def test_the_same_bundle_gives_the_same_files(objects, tmp_path):
+    for form in ("urdf", "mjcf", "glb", "ply"):
+        texts = []
+        for name in ("a", "b"):
+            bundle = objects.chain(["free", "screw"])
+            texts.append(export(bundle, objects.robot(bundle), form, tmp_path / name / form).read_bytes())
+        assert texts[0] == texts[1]
+
+
+def test_usd_without_its_library_is_refused_before_any_work(monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "pxr" else find(name, *rest))
+    require(["urdf", "mjcf", "glb", "ply"])
+    with pytest.raises(InputError, match="pip install usd-core"):
+        require(["urdf", "usd"])
+
+
+def corners_of(path, form):
+    """The two corners of the box about all visual meshes at rest [2, 3], as the program of a format sees it."""
+    if form == "urdf":
+        return yourdfpy.URDF.load(str(path)).scene.bounds
+    if form == "glb":
+        turned = trimesh.load_scene(path).bounds  # y is up
+        return np.sort(turned @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]), axis=0)
+    if form == "mjcf":
+        mujoco = pytest.importorskip("mujoco")
+        model = mujoco.MjModel.from_xml_path(str(path))
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        points = []
+        for geom in np.flatnonzero(model.geom_group == 2):
+            mesh = model.geom_dataid[geom]
+            start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+            R = data.geom_xmat[geom].reshape(3, 3)
+            points.append(model.mesh_vert[start : start + count] @ R.T + data.geom_xpos[geom])
+        points = np.concatenate(points)
+        return np.stack([points.min(0), points.max(0)])
+    UsdGeom = pytest.importorskip("pxr.UsdGeom")
+    from pxr import Usd
+
+    stage = Usd.Stage.Open(str(path))
+    box = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["default"]).ComputeWorldBound(stage.GetDefaultPrim())
+    aligned = box.ComputeAlignedRange()
+    return np.array([aligned.GetMin(), aligned.GetMax()])
+
+
+@pytest.mark.parametrize("form", ["urdf", "mjcf", "usd", "glb"])
+def test_meshes_are_where_and_as_large_as_in_the_bundle(objects, write, form):
+    shapes = objects.shapes(objects.chain(["revolute", "screw"]))
+    corners = np.concatenate([shape.surface.bounds for shape in shapes.values()])
+    expected = 0.5 * np.stack([corners.min(0), corners.max(0)])
+    np.testing.assert_allclose(corners_of(write(form, scale=0.5), form), expected, atol=1e-6)
