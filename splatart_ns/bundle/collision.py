@@ -12,6 +12,8 @@ _log = logging.getLogger(__name__)
 
 _TRIANGLES = 1500
 """Of the mesh that is taken apart: the time grows fast with their number."""
+_LOST_VOLUME = 0.1
+"""Share of the volume that this may change."""
 _CONCAVITY = 0.08
 """Tolerated difference between a piece and its hull, in CoACD's measure, of the mesh scaled to sides of 2."""
 
@@ -68,16 +70,16 @@ def _hull_of(points: np.ndarray) -> trimesh.Trimesh | None:
 
 
 def _with_few_triangles(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A coarser mesh of the same solid, of _TRIANGLES or what 2 % of its size as tolerance leaves."""
-    size = float(mesh.extents.max())
+    """A coarser mesh of the same solid, of _TRIANGLES or as few as keep its volume: thin sheets lose pieces first."""
     solid = manifold3d.Manifold(manifold3d.Mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)))
     if solid.is_empty():  # Not a manifold: CoACD mends it.
         return mesh
-    tolerance = 0.003 * size
-    simple = solid.simplify(tolerance)
-    while simple.num_tri() > _TRIANGLES and tolerance < 0.02 * size:
-        tolerance *= 1.3
-        simple = solid.simplify(tolerance)
+    tolerance, simple = 5e-4 * float(mesh.extents.max()), solid
+    while simple.num_tri() > _TRIANGLES:
+        coarser = solid.simplify(tolerance)
+        if abs(coarser.volume() / solid.volume() - 1) > _LOST_VOLUME:
+            break
+        tolerance, simple = 1.4 * tolerance, coarser
     data = simple.to_mesh()
     return trimesh.Trimesh(data.vert_properties[:, :3].astype(np.float64), data.tri_verts, process=False)
 

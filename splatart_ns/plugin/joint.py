@@ -31,6 +31,7 @@ from splatart_ns.stages.joint import JOINT_DOFS, JointFit
 from splatart_ns.stages.joint_constraint import parse_constraints
 from splatart_ns.stages.pose import carry
 from splatart_ns.stages.tree import EPSILON, JointMethod, infer_tree
+from splatart_ns.stages.unseen import known_states, place_unseen
 
 JOINT_TYPES = tuple(JOINT_DOFS)
 MIN_POINT_OPACITY = 0.3
@@ -237,6 +238,9 @@ class JointPipeline(VanillaPipeline):
         base = state["_model.poses.base"]
         motions = torch.from_numpy(normalization.motion_to_world(base.numpy()))
         covariances = covariances_to_world(state["_model.covariance"], normalization)
+        part_motions = {p: motions[:, p - 1] for p in capture.parts}
+        part_covariances = {p: covariances[:, p - 1] for p in capture.parts}
+        known = known_states(part_motions, part_covariances)
         present = [p for p in capture.parts if bool((ids == p).any())]
         points = {p: surface_points(world.select(ids == p)) for p in present}
         held = state["_model.held_ratio"]
@@ -247,12 +251,14 @@ class JointPipeline(VanillaPipeline):
             if a != b and bool(torch.isfinite(held[a - 1, b - 1]))
         }
         root = next((p for p, name in capture.parts.items() if name == config.root), None)
-        if config.root is not None and root not in present:
-            raise InputError(f"{capture.path} has no part '{config.root}' with Gaussians; choose another root.")
+        if config.root is not None and not (root in present and known[root][0]):
+            raise InputError(
+                f"{capture.path} has no part '{config.root}' with Gaussians at state 0; choose another root."
+            )
         self.tree = infer_tree(
             points,
-            {p: motions[:, p - 1] for p in present},
-            covariances={p: covariances[:, p - 1] for p in present},
+            {p: part_motions[p] for p in present},
+            covariances={p: part_covariances[p] for p in present},
             root=root,
             render_ratios=ratios,
             epsilon=config.epsilon,
@@ -262,12 +268,18 @@ class JointPipeline(VanillaPipeline):
         self.notes = [f"{capture.parts[part]}: {reason}" for part, reason in self.tree.unattached.items()]
         for note in self.notes:
             CONSOLE.log(note)
+        if not all(bool(states.all()) for states in known.values()):
+            places, part_motions, _ = place_unseen(self.tree, part_motions, known)
+            motions = torch.stack([part_motions[p] for p in sorted(capture.parts)], dim=1)
+            shift = torch.stack([torch.stack([torch.eye(4).to(X), X]) for _, X in sorted(places.items())], dim=1)
+            splat = carry([splat], torch.from_numpy(normalization.motion_to_normal(shift.numpy())), 0, 1)
+            world, ids = splat_to_world(splat, normalization), splat.part_ids
         self.model.start(splat, self.tree, motions, normalization)
         self.bundle: Bundle = assemble_bundle(
             self.tree,
             {p: world.select(ids == p) for p in capture.parts},
-            {p: motions[:, p - 1] for p in capture.parts},
-            {p: covariances[:, p - 1] for p in capture.parts},
+            part_motions,
+            part_covariances,
             capture.parts,
             [s.name for s in capture.states],
             capture.length_unit,

@@ -26,7 +26,7 @@ from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
-from splatart_ns.stages.pose_evidence import refine_poses, rotation_held_ratios
+from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import initial_motion
 from splatart_ns.stages.visibility import visibility
 
@@ -77,8 +77,11 @@ class PoseModel(SplatartModel):
         return self.splat.select(self.state_ids == state)
 
     def splat_at(self, state: int, T: Tensor) -> Splat:
-        """The merged Gaussians at an observed state, T [S, P, 4, 4]."""
-        return carry([self.splat], T[[0, state]], 0, 1)
+        """The merged Gaussians at an observed state, T [S, P, 4, 4], without parts whose pose there is not known."""
+        known = self.covariance[state].isfinite().flatten(1).all(-1)
+        splat = self.splat
+        shown = torch.cat([torch.ones_like(known[:1]), known])[splat.part_ids]
+        return carry([splat.select(shown)], T[[0, state]], 0, 1)
 
     @torch.no_grad()
     def posed_splat(self) -> Splat:
@@ -130,8 +133,9 @@ class PosePipeline(VanillaPipeline):
         ]
         runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
         splats = [self._load_splat(run).to(device) for run in runs]
-        base, frozen = self._initial_poses(splats)
-        self.model.start(splats, base, frozen)
+        S, P = len(splats), self.model.num_parts
+        self._reference, self._known, self._frozen = [0] * P, torch.ones(S, P, dtype=torch.bool), torch.zeros(S, P) > 0
+        self.model.start(splats, self._initial_poses(splats), self._frozen)
         self._pairs = self._shuffled_pairs()
         self._own = self._shuffled_views()
 
@@ -147,29 +151,36 @@ class PosePipeline(VanillaPipeline):
             raise InputError(f"{run} learned no parts; train splatart-semantic longer, with labelled frames.")
         return splat.select(splat.part_ids > 0)
 
-    def _initial_poses(self, splats: list[Splat]) -> tuple[Tensor, Tensor]:
-        """Base poses [S, P, 4, 4] and which of them stay as they are [S, P]."""
-        S, P = len(splats), self.model.num_parts
-        base = torch.eye(4, dtype=torch.float64).repeat(S, P, 1, 1)
-        frozen = torch.zeros(S, P, dtype=torch.bool)
+    def _initial_poses(self, splats: list[Splat]) -> Tensor:
+        """Poses [S, P, 4, 4] to begin from; keeps in mind the reference states, and what is known and what stays."""
         if self.config.init == "file":
-            return self._poses_from_file(), frozen
-        centroids = [part_extents(s, P)[0].cpu() for s in splats]
+            return self._poses_from_file()
+        S, P = self._known.shape
+        M = torch.eye(4, dtype=torch.float64).repeat(S, P, 1, 1)
+        if self.config.init == "centroids":
+            centroids = torch.stack([part_extents(s, P)[0].cpu() for s in splats])
+            M[..., :3, 3] = centroids - centroids[0]
+            return M
         seen = [visibility(s, v) for s, v in zip(splats, self.views, strict=True)]
-        for s in range(1, S):
-            for p in range(P):
-                if self.config.init == "centroids":
-                    base[s, p, :3, 3] = centroids[s][p] - centroids[0][p]
+        self._reference = reference_states(splats, seen, P)
+        for p, first in enumerate(self._reference):
+            for s in range(S):
+                if s == first:
                     continue
-                pair = [(everything[0], everything[s]) for everything in (splats, self.views, seen)]
+                pair = [(everything[first], everything[s]) for everything in (splats, self.views, seen)]
                 motion = initial_motion(*pair, p + 1, self.config.seed)
-                name = f"part {self.model.part_names[p + 1]}, state {s}"
-                if not motion.found:
-                    self.notes.append(f"{name}: too few Gaussians to find its pose; it is held still.")
-                    CONSOLE.log(self.notes[-1])
-                base[s, p] = motion.T.cpu()
-                frozen[s, p] = not motion.found or (self.config.snap and motion.still)
-        return base, frozen
+                M[s, p] = motion.T.cpu()
+                self._known[s, p] = motion.found
+                self._frozen[s, p] = not motion.found or (self.config.snap and motion.still)
+        return since_state_0(M, self._known)
+
+    def _note_unknown(self, known: Tensor) -> None:
+        """Say which poses [S, P] of a part no image tells."""
+        for s, p in (~known).nonzero().tolist():
+            part = f"part {self.model.part_names[p + 1]}, state {s}"
+            put = "it is put where another state shows it" if s == 0 else "it moves as what it hangs on"
+            self.notes.append(f"{part}: the images show too little of it to find its pose; {put}.")
+            CONSOLE.log(self.notes[-1])
 
     def _poses_from_file(self) -> Tensor:
         if self.config.init_file is None:
@@ -259,11 +270,13 @@ class PosePipeline(VanillaPipeline):
         """End the search for poses, then keep one set of Gaussians, in the canonical frame."""
         model = self.model
         splats = [model.state_splat(s).detach() for s in range(model.num_states)]
-        frozen = torch.cat([torch.ones_like(model.poses.free[:1]), ~model.poses.free])
-        T, model.covariance = refine_poses(splats, self.views, model.poses.T(), frozen)
+        T, model.covariance, model.held_ratio = refine_known_poses(
+            splats, self.views, model.poses.T(), self._frozen, self._reference, self._known
+        )
         model.poses.commit(T)
-        model.held_ratio = rotation_held_ratios(splats, self.views, T)
-        merged = Splat.cat(merge_parts(splats, self.views, T))
+        known = model.covariance.isfinite().flatten(2).all(-1)
+        self._note_unknown(known)
+        merged = Splat.cat(merge_parts(splats, self.views, T, known))
         params = gauss_params_from_splat(merged)
         for name, parameter in params.items():
             model.gauss_params[name] = parameter

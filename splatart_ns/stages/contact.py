@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from splatart_ns.geometry.se3 import inverse, transform_points
+from splatart_ns.stages.unseen import known_states, relative_motion
 
 _MAX_POINTS = 2000
 _TOUCHING = 0.01  # share of a part's points that counts as its contact
@@ -37,19 +38,31 @@ class Contact:
 
 
 def find_contacts(
-    points: dict[int, Tensor], motions: dict[int, Tensor], pairs: Iterable[tuple[int, int]] | None = None
+    points: dict[int, Tensor],
+    motions: dict[int, Tensor],
+    pairs: Iterable[tuple[int, int]] | None = None,
+    known: Mapping[int, Tensor] | None = None,
 ) -> dict[tuple[int, int], Contact]:
     """Contacts of pairs (a, b), by default all with a < b, of parts with points [N, 3] at state 0, motions [S, 4, 4].
 
-    Of a part with more than 2000 points, evenly picked ones are used.
+    Of a part with more than 2000 points, evenly picked ones are used. `known`: in which states the motions are known
+    [S] bool, by default all; the others do not count.
     """
+    motions = {p: T.double() for p, T in motions.items()}
+    known = known or known_states(motions, None)
     sampled = {p: x[:: math.ceil(len(x) / _MAX_POINTS)].double() for p, x in points.items()}
     trees = {p: cKDTree(x.numpy(force=True)) for p, x in sampled.items()}
     pairs = [(a, b) for a in sorted(points) for b in sorted(points) if a < b] if pairs is None else pairs
-    return {
-        (a, b): _contact(sampled[a], sampled[b], trees[a], trees[b], inverse(motions[a].double()) @ motions[b].double())
-        for a, b in pairs
-    }
+    contacts = {}
+    for pair in pairs:
+        a, b = pair if known[pair[0]][0] else pair[::-1]
+        T_rel, place, _ = relative_motion(motions[a], motions[b], known[a], known[b])
+        placed, tree = sampled[b], trees[b]
+        if not known[b][0]:
+            placed = transform_points(place, placed)
+            tree = cKDTree(placed.numpy(force=True))
+        contacts[pair] = _contact(sampled[a], placed, trees[a], tree, T_rel)
+    return contacts
 
 
 def _contact(points_a: Tensor, points_b: Tensor, tree_a: cKDTree, tree_b: cKDTree, T_a_b: Tensor) -> Contact:

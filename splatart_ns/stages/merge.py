@@ -19,20 +19,25 @@ COVERED = 3.0
 """A centre within so many standard deviations of a Gaussian is where that Gaussian already is."""
 
 
-def merge_parts(splats: Sequence[Splat], views: Sequence[Sequence[View]], T: Tensor) -> list[Splat]:
+def merge_parts(
+    splats: Sequence[Splat], views: Sequence[Sequence[View]], T: Tensor, known: Tensor | None = None
+) -> list[Splat]:
     """The splats of parts 1..P in the canonical frame, from all states.
 
     Args:
         splats: One labelled splat per state.
         views: Training views of each state; they decide which Gaussians are seen.
         T: Poses [S, P, 4, 4].
+        known: Which of them were found [S, P] bool, by default all. A part is not taken from a state where its pose was
+            not.
 
     Returns:
         One splat per part; empty for a part without Gaussians. Background and unseen Gaussians are gone.
     """
     seen = [visibility(s, v) for s, v in zip(splats, views, strict=True)]
     footprint = _pixel_footprint(views[0])
-    return [_merge_part(splats, seen, T[:, p], p + 1, footprint) for p in range(T.shape[1])]
+    known = torch.ones(T.shape[:2], dtype=torch.bool) if known is None else known
+    return [_merge_part(splats, seen, T[:, p], known[:, p], p + 1, footprint) for p in range(T.shape[1])]
 
 
 def _pixel_footprint(views: Sequence[View]) -> float:
@@ -40,10 +45,12 @@ def _pixel_footprint(views: Sequence[View]) -> float:
     return float(torch.tensor([float(v.viewmat[:3, 3].norm() / v.K[0, 0]) for v in views]).median())
 
 
-def _merge_part(splats: Sequence[Splat], seen: Sequence[Tensor], T: Tensor, part: int, footprint: float) -> Splat:
+def _merge_part(
+    splats: Sequence[Splat], seen: Sequence[Tensor], T: Tensor, known: Tensor, part: int, footprint: float
+) -> Splat:
     pieces, amount = [], []
-    for splat, visible, pose in zip(splats, seen, T, strict=True):
-        visible = torch.where(splat.part_ids == part, visible, 0.0)
+    for splat, visible, pose, found in zip(splats, seen, T, known, strict=True):
+        visible = torch.where((splat.part_ids == part) & found.to(visible.device), visible, 0.0)
         pieces.append(splat.select(shown(visible, SHOWN) & (visible > 0)).detach().transformed(inverse(pose)))
         amount.append(float(visible.sum()))
     order = sorted(range(len(pieces)), key=lambda s: -amount[s])

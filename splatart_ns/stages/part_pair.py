@@ -17,6 +17,9 @@ from splatart_ns.splats.splat import Splat
 
 RGB_WEIGHT = 0.3
 """Weight of a colour difference against one of silhouettes: the pose is in the shape, light misleads."""
+CHROMA_WEIGHT = 2.0
+"""That of what is left of a colour difference without its mean over the channels, where asked for: light that stays in
+the world while parts turn changes how bright they are, and hardly their hue."""
 HUBER = 0.15
 """Residuals beyond this count linearly."""
 MARGIN = 8
@@ -62,10 +65,11 @@ class PartView:
         )
         return torch.cat([image, accumulation], -1)
 
-    def difference(self, splat: Splat, T: Tensor) -> Tensor:
-        """How the splat under motions [K, 4, 4] differs from the part [K, H, W, 4], colours by `RGB_WEIGHT`."""
+    def difference(self, splat: Splat, T: Tensor, chroma_weight: float = RGB_WEIGHT) -> Tensor:
+        """How the splat under motions [K, 4, 4] differs from the part [K, H, W, 4], brightness by `RGB_WEIGHT`."""
         difference = self.render(splat, T) - self.rgba
-        difference[..., :3] *= RGB_WEIGHT
+        brightness = difference[..., :3].mean(-1, keepdim=True)
+        difference[..., :3] = RGB_WEIGHT * brightness + chroma_weight * (difference[..., :3] - brightness)
         return difference
 
 
@@ -154,6 +158,7 @@ class PartPair:
     """Of the part in the source state [3] float64."""
     radius: float
     """Root mean square distance of the part's Gaussians from the centroid."""
+    chroma_weight: float = RGB_WEIGHT
 
     @property
     def area(self) -> float:
@@ -167,7 +172,7 @@ class PartPair:
         """
         for splat, views, motion in zip(self.splats, reversed(self.views), (T, inverse(T)), strict=True):
             for view in views:
-                yield view.difference(splat, motion), view.weight
+                yield view.difference(splat, motion, self.chroma_weight), view.weight
 
     def own_cost(self) -> float:
         """What `cost` would be if each state's Gaussians were looked at in their own state's views."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -11,7 +12,7 @@ from torch import Tensor
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import inverse, so3_log
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.part_pair import part_pair
+from splatart_ns.stages.part_pair import CHROMA_WEIGHT, part_pair
 from splatart_ns.stages.refinement import motion_covariance, refine, rotation_held_ratio
 from splatart_ns.stages.render_choice import FINE_PIXELS, VIEWS
 
@@ -27,8 +28,8 @@ def refine_poses(
 ) -> tuple[Tensor, Tensor]:
     """The last rung of the search for poses: Gauss-Newton on all views, and the certainty that they give.
 
-    Few views leave the turn of a round part to chance, and the colours of a photometric loss mislead it, because light
-    stays in the world while parts turn; the silhouettes of all views hold it.
+    Few views leave the turn of a round part to chance, and the brightness of a photometric loss misleads it, because
+    light stays in the world while parts turn; silhouettes and hues of all views hold it.
 
     Args:
         splats: One labelled splat per state.
@@ -49,7 +50,7 @@ def refine_poses(
             if pair is None:
                 covariances[s, p] = torch.nan
                 continue
-            equations = None
+            pair, equations = replace(pair, chroma_weight=CHROMA_WEIGHT), None
             if not frozen[s, p]:
                 found = refine(pair, T[s, p], MAX_ITERATIONS)
                 T[s, p], equations = found.T, found.equations

@@ -26,6 +26,10 @@ FOLLOWED = 16
 TRIMS = (0.15, 0.5)
 """Shares of the worst correspondences that the steps leave out, for what only one of the states shows: a little, or,
 of a drawer that was shut, a lot."""
+SLIDES = 6
+"""Slides of a grid that are followed."""
+SLIDE_STEP, SLIDE_STEPS = 0.3, 5
+"""The grid's step in part radii, and how many of them it reaches to each side."""
 COLOUR = 0.3
 """Colour difference (0 to 1) of one counts as this many part radii."""
 
@@ -76,8 +80,8 @@ def register(source: PartPoints, target: PartPoints, seed: int = 0, keep: int = 
 
     Starts: no motion, centroid on centroid with no turn, with the four proper alignments of the principal axes, and
     with random turns. All starts are followed together, once for each of `TRIMS`, and the `FOLLOWED` best to the end;
-    of each, at most `keep` are kept. The two starts without a turn are also followed by sliding alone. Needs
-    `MIN_POINTS` points on both sides.
+    of each, at most `keep` are kept. The two starts without a turn, and the best of a grid of slides, are also followed
+    by sliding alone: sliding is so common that it is not to be crowded out. Needs `MIN_POINTS` points on both sides.
     """
     rng = np.random.default_rng(seed)
     colour = COLOUR * target.radius
@@ -86,9 +90,10 @@ def register(source: PartPoints, target: PartPoints, seed: int = 0, keep: int = 
     sample, back_sample = _sample(source, rng), _sample(target, rng)
 
     starts = _starts(source, target, rng)
+    straight = np.concatenate([starts[:2], _slides(sample, back_sample, colour, source_tree, target_tree)])
     motions, fits = [], []
     for trim in TRIMS:
-        T, slides = starts, starts[:2]
+        T, slides = starts, straight
         for iteration in range(ITERATIONS):
             if iteration == ITERATIONS // 3:
                 fit = _trimmed_distance(T, sample, colour, target_tree, trim)
@@ -100,8 +105,7 @@ def register(source: PartPoints, target: PartPoints, seed: int = 0, keep: int = 
         back = _trimmed_distance(np.linalg.inv(T), back_sample, colour, source_tree, trim)
         fit = (forth + back) / 2
         chosen = distinct(T, fit, source.centroid, source.radius)[:keep]
-        # Sliding is so common that it is not to be crowded out.
-        chosen += [i for i in (len(T) - 2, len(T) - 1) if i not in chosen]
+        chosen += [i for i in range(len(T) - len(slides), len(T)) if i not in chosen]
         motions.append(T[chosen])
         fits.append(fit[chosen])
     T, fit = np.concatenate(motions), np.concatenate(fits)
@@ -136,17 +140,17 @@ def _normals(points: PartPoints) -> np.ndarray:
     return np.linalg.eigh(centred.swapaxes(1, 2) @ centred)[1][..., 0]
 
 
-def distinct(T: np.ndarray, cost: np.ndarray, centroid: np.ndarray, radius: float) -> list[int]:
+def distinct(T: np.ndarray, cost: np.ndarray, centroid: np.ndarray, radius: float, shift: float = 0.06) -> list[int]:
     """Indices of motions [C, 4, 4] by rising cost, without those nearly equal to a cheaper one.
 
-    Nearly equal: less than 6 degrees apart, and less than 6 % of `radius` at `centroid`.
+    Nearly equal: less than 6 degrees apart, and less than `shift` times `radius` at `centroid`.
     """
     chosen: list[int] = []
     for i in np.argsort(cost, kind="stable"):
         D = T[chosen]
         cosine = (np.einsum("kij,ij->k", D[:, :3, :3], T[i, :3, :3]) - 1) / 2
         moved = np.linalg.norm((D[:, :3] - T[i, :3]) @ np.append(centroid, 1.0), axis=-1)
-        if not np.any((cosine > np.cos(np.radians(6))) & (moved < 0.06 * radius)):
+        if not np.any((cosine > np.cos(np.radians(6))) & (moved < shift * radius)):
             chosen.append(int(i))
     return chosen
 
@@ -177,6 +181,27 @@ def _starts(source: PartPoints, target: PartPoints, rng: np.random.Generator) ->
     T[:, :3, :3] = R
     T[:, :3, 3] = target.centroid - R @ source.centroid
     return np.concatenate([np.eye(4)[None], T])
+
+
+def _slides(
+    source: PartPoints, target: PartPoints, colour: float, source_tree: cKDTree, target_tree: cKDTree
+) -> np.ndarray:
+    """The best distinct ones [K, 4, 4] of a grid of slides about that which brings centroid on centroid.
+
+    What one state hides of a part draws its centroid aside, and nearest points draw a drawer's front to its back. Here
+    it suffices that either state's points lie on the other's: a drawer that is shut shows its front alone.
+    """
+    ticks = SLIDE_STEP * np.arange(-SLIDE_STEPS, SLIDE_STEPS + 1) * target.radius
+    offsets = np.stack(np.meshgrid(ticks, ticks, ticks), axis=-1).reshape(-1, 3)
+    T = np.tile(np.eye(4), (len(offsets), 1, 1))
+    T[:, :3, 3] = target.centroid - source.centroid + offsets
+    few = [PartPoints(p.xyz[::k], p.rgb[::k], p.weight[::k]) for p in (source, target) for k in [len(p.xyz) // 50 + 1]]
+    forth = _trimmed_distance(T, few[0], colour, target_tree, TRIMS[0])
+    back = _trimmed_distance(np.linalg.inv(T), few[1], colour, source_tree, TRIMS[0])
+    fit = np.minimum(forth, back)
+    best = fit.argsort(kind="stable")[:100]
+    T, fit = T[best], fit[best]
+    return T[distinct(T, fit, source.centroid, source.radius, shift=1.2 * SLIDE_STEP)[:SLIDES]]
 
 
 def _moved_features(T: np.ndarray, sample: PartPoints, colour: float) -> np.ndarray:

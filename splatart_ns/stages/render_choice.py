@@ -14,6 +14,7 @@ from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import PartPair, part_pair
 from splatart_ns.stages.refinement import increment, refine
 from splatart_ns.stages.registration import MIN_POINTS, distinct, part_points, point_to_plane, register
+from splatart_ns.stages.shading import without_shading
 
 VIEWS = 5
 """Views of each state that are compared."""
@@ -30,6 +31,8 @@ SUSPECT = 4.0
 Right ones measured 1.0 to 2.5, but for parts of which one state hides most."""
 SEARCH_STEPS = (0.6, 0.3, 0.15, 0.08)
 """Steps of that search: part radii, and radians."""
+SLIDE_TURN = 6.0
+"""Degrees by which a slide may seem to turn."""
 STILL_RATIO = 1.2
 """A part whose images fit no motion worse than this many times the best motion did not move."""
 
@@ -49,7 +52,7 @@ class InitialMotion:
     identity_ratio: float = float("nan")
     """Cost of no motion over the best cost."""
     runner_up_ratio: float = float("inf")
-    """Cost of the best candidate that ended elsewhere over the best cost: near 1, the choice was ambiguous."""
+    """`appearance_cost` of the best candidate that ended elsewhere over the best: near 1, the choice was ambiguous."""
 
 
 def initial_motion(
@@ -91,8 +94,9 @@ def initial_motion(
         tiny = part_pair(splats, views, part, 3, TINY_PIXELS)
         wide = torch.stack([search(tiny, T) for T in choose(coarse, everything, float("inf"), keep=5)])
         ends += [refine(fine, T, 10) for T in choose(coarse, wide, 1.5)]
-    cost = np.array([e.cost for e in ends])
-    order = distinct(torch.stack([e.T for e in ends]).cpu().numpy(), cost, source.centroid, source.radius)
+    cost = appearance_cost(fine, torch.stack([e.T for e in ends]))
+    T = torch.stack([e.T for e in ends]).cpu().numpy()
+    order = prefer_slide(T, cost, distinct(T, cost, source.centroid, source.radius))
     best = ends[order[0]]
     identity_ratio = identity_cost / max(best.cost, 1e-12)
     still = identity_ratio < STILL_RATIO
@@ -102,7 +106,7 @@ def initial_motion(
         still=still,
         cost=best.cost,
         identity_ratio=identity_ratio,
-        runner_up_ratio=cost[order[1]] / max(best.cost, 1e-12) if len(order) > 1 else float("inf"),
+        runner_up_ratio=cost[order[1]] / max(cost[order[0]], 1e-12) if len(order) > 1 else float("inf"),
     )
 
 
@@ -123,11 +127,29 @@ def search(pair: PartPair, T: Tensor) -> Tensor:
     return T
 
 
+def prefer_slide(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]:
+    """`order` of motions [C, 4, 4] by cost [C], with a slide first that fits nearly as well as a best one by which the
+    part turns over.
+
+    Where one state hides most of a part, no motion fits well: a drawer was seen to render a tenth better turned over.
+    """
+    turn = np.degrees(np.arccos(((np.einsum("cii->c", T[:, :3, :3]) - 1) / 2).clip(-1, 1)))
+    slides = [i for i in order if turn[i] < SLIDE_TURN and cost[i] < STILL_RATIO * cost[order[0]]]
+    if turn[order[0]] < 90 or not slides:
+        return order
+    return [slides[0], *(i for i in order if i != slides[0])]
+
+
+def appearance_cost(pair: PartPair, T: Tensor) -> np.ndarray:
+    """Of motions T [C, 4, 4]: the mean cost with the colours as they are lit, and with their hues alone [C]."""
+    return (0.5 * (pair.cost(T) + without_shading(pair).cost(T))).cpu().numpy()
+
+
 def choose(pair: PartPair, candidates: Tensor, similar: float, keep: int = 3) -> Tensor:
     """The distinct motions [K, 4, 4] among `candidates` [C, 4, 4] that render best, best first.
 
     At most `keep`, and none that costs more than `similar` times the best.
     """
-    cost = pair.cost(candidates).cpu().numpy()
+    cost = appearance_cost(pair, candidates)
     order = distinct(candidates.cpu().numpy(), cost, pair.centroid.cpu().numpy(), pair.radius)
     return candidates[[i for i in order[:keep] if cost[i] <= similar * cost[order[0]]]]

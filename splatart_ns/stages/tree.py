@@ -38,6 +38,7 @@ from splatart_ns.stages.joint import (
 from splatart_ns.stages.joint_constraint import JointConstraint, required_parents
 from splatart_ns.stages.joint_descent import descend_joint
 from splatart_ns.stages.tree_refinement import refine_tree
+from splatart_ns.stages.unseen import known_states, place_unseen, relative_motion
 
 JointMethod = Literal["screw", "descent"]
 _SEEN_NOISE = 0.3
@@ -95,9 +96,14 @@ def infer_tree(
         pair = {p: points[p] for p in (c.parent, c.child)}
         told = _told(c, joints, pair, motions, radius, covariances=covariances, noise=noise, epsilon=epsilon)
         joints = {edge: fit for edge, fit in joints.items() if set(edge) != set(pair)} | told
+    known = known_states(motions, covariances)
+    # A part of which nothing tells where it is at state 0 hangs on others, and nothing hangs on it.
+    lost = {p for p in points if not known[p][0]}
+    joints = {(a, b): fit for (a, b), fit in joints.items() if a not in lost}
     if root is None:
-        root = choose_root({p: x for p, x in points.items() if p not in required}, motions, radius, noise)
-    contacts = find_contacts(points, motions, {_pair(*edge) for edge, fit in joints.items() if fit.accepted})
+        free = [p for p in points if p not in required]
+        root = choose_root({p: points[p] for p in set(free) - lost or free}, motions, radius, noise)
+    contacts = find_contacts(points, motions, {_pair(*edge) for edge, fit in joints.items() if fit.accepted}, known)
     groups = _free_groups(points, motions, joints, contacts, root, radius, required)
     contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups})
     tree = build_tree(sorted(points), joints | groups, contacts, root, radius, required)
@@ -108,12 +114,13 @@ def infer_tree(
         return tree
     errors = {}
     floor = noise if covariances is None else _SEEN_NOISE * noise
+    places, motions, known = place_unseen(tree, motions, known)
+    points = {p: transform_points(places[p].to(x), x) for p, x in points.items()}
     for p, x in points.items():
         errors[p] = _surface_error(x.double(), motions[p].double(), floor, radius)
         if covariances is not None:
             unknown = (10 * radius) ** 2 * torch.eye(6).to(errors[p])
-            seen = covariances[p].to(errors[p])
-            errors[p] = errors[p] + torch.where(seen.isfinite().all(-1).all(-1)[..., None, None], seen, unknown)
+            errors[p] = errors[p] + torch.where(known[p][:, None, None], covariances[p].to(errors[p]), unknown)
     return refine_tree(tree, points, motions, errors)
 
 
@@ -153,24 +160,29 @@ def fit_pairs(
 ) -> dict[tuple[int, int], JointFit]:
     """Joints of all pairs by (parent, child), both ways round; arguments as in `infer_tree` and `fit_joint`."""
     motions = {p: T.double() for p, T in motions.items()}
+    states = known_states(motions, covariances)
     # What stood still is known exactly: all errors of the pair are the other part's, which is then the child.
-    still = {p: bool((motions[p] == torch.eye(4).to(motions[p])).all()) for p in points}
-    pairs = [(a, b) for a in sorted(points) for b in sorted(points) if (not still[a], a) < (not still[b], b)]
+    still = {p: bool((motions[p] == torch.eye(4).to(motions[p])).all() and states[p].all()) for p in points}
+    # So is what is not known at state 0.
+    order = sorted(points, key=lambda p: (not states[p][0], not still[p], p))
+    pairs = [(a, b) for k, a in enumerate(order) for b in order[k + 1 :]]
     if not pairs:
         return {}
     ratios = render_ratios or {}
     # The parent's error reaches the child by its lever arm; the child's own is added by `fit_joints`.
     errors = {p: _surface_error(points[p].double(), motions[p], noise, object_radius) for p in points}
     errors |= {p: torch.zeros_like(errors[p]) for p in points if still[p]}
-    T_rel = torch.stack([inverse(motions[a]) @ motions[b] for a, b in pairs])
+    relative = [relative_motion(motions[a], motions[b], states[a], states[b]) for a, b in pairs]
+    T_rel, places, known_rel = (torch.stack(of_pairs) for of_pairs in zip(*relative, strict=True))
     to_parent = adjoint(torch.stack([inverse(motions[a]) for a, _ in pairs]))
     known = torch.stack([errors[a] for a, _ in pairs])
     if covariances is not None:
         moved = {p: C * (not still[p]) for p, C in covariances.items()}
         known = known + torch.stack([moved[a] + moved[b] for a, b in pairs]).to(known)
+    known = torch.where(known_rel[..., None, None], known, torch.nan)
     fits = fit_joints(
         T_rel,
-        [points[b] for _, b in pairs],
+        [transform_points(place, points[b].to(place)) for (_, b), place in zip(pairs, places, strict=True)],
         object_radius,
         to_parent @ known @ to_parent.mT,
         noise,

@@ -50,3 +50,18 @@ def test_without_coacd_the_hull_stands_for_the_mesh(monkeypatch, caplog):
     (piece,) = convex_pieces(tray())
     assert piece.volume == pytest.approx(0.24)
     assert "coacd" in caplog.text
+
+
+def test_a_thin_rough_sheet_stays_whole():
+    """A blade of many triangles, as marching cubes leave it, thinner than what coarsening it may move."""
+    pytest.importorskip("coacd")
+    blade = trimesh.creation.annulus(0.4, 0.5, 0.004, sections=128)
+    blade = trimesh.boolean.intersection([blade, trimesh.creation.box((0.8, 2, 1))])
+    while len(blade.faces) < 8000:
+        blade = blade.subdivide()
+    rough = np.random.default_rng(0).normal(scale=4e-4, size=blade.vertices.shape)
+    blade.vertices += rough
+    assert blade.is_volume
+    points = blade.sample(500, seed=0)
+    outside = [np.maximum(-trimesh.proximity.signed_distance(piece, points), 0) for piece in convex_pieces(blade)]
+    assert np.min(outside, axis=0).max() < 0.02

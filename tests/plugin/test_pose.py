@@ -107,6 +107,16 @@ def test_gaussians_wait_for_the_poses_or_learn_along(pose_trainer, learn):
     assert torch.isfinite(model.covariance).all()
 
 
+def test_a_part_is_not_shown_in_a_state_where_its_pose_is_not_known(pose_trainer):
+    pipeline = pose_trainer(init="centroids").pipeline
+    model, known = pipeline.model, torch.tensor([[True, False], [True, True]])
+    model.covariance[~known] = torch.nan
+    shown = [set(model.splat_at(state, model.poses.T()).part_ids.tolist()) for state in (0, 1)]
+    assert shown == [{1}, {1, 2}]
+    pipeline._note_unknown(known)
+    assert len(pipeline.notes) == 1 and pipeline.notes[0].startswith("part lid, state 0: ")
+
+
 def test_a_run_that_would_never_merge_is_refused(pose_trainer):
     with pytest.raises(InputError, match="max-num-iterations"):
         pose_trainer(steps=4, pose_steps=4, init="centroids")

@@ -47,6 +47,23 @@ def test_a_part_half_hidden_in_one_state_is_still_found():
     assert displacement(best, truth, source) < 0.1
 
 
+def test_a_drawer_that_was_shut_is_found_by_its_front():
+    """Nothing but the front is seen of it at first; then the inside, too."""
+    rng = np.random.default_rng(0)
+    front = np.stack([np.zeros(400), *(rng.random((2, 400)) - 0.5)], axis=1) * [0.0, 1.0, 0.5]
+    sides = np.stack([-rng.random(900), *np.sign(rng.random((2, 900)) - 0.5) / 2], axis=1)
+    sides[:450, 1], sides[450:, 2] = rng.random(450) - 0.5, rng.random(450) - 0.5
+    back = front[:300] - [1.0, 0.0, 0.0]
+    opened = np.concatenate([front, sides * [1.0, 1.0, 0.5], back])
+    rgb = np.full(opened.shape, 0.4)
+    rgb[:400, 0], rgb[:400, 1] = 0.8, 0.5 + 0.4 * np.sign(front[:, 1])
+    truth = motion((0, 0, 0), (0.8, 0.0, 0.0))
+    shut = PartPoints(front, rgb[:400], np.ones(400))
+    found = register(shut, moved(PartPoints(opened, rgb, np.ones(len(opened))), truth, noise=0.004))
+    slides = [T for T in found.T if np.allclose(T[:3, :3], np.eye(3))]
+    assert min(displacement(T, truth, shut) for T in slides) < 0.05
+
+
 def test_colours_tell_the_ends_of_a_bar_apart():
     rng = np.random.default_rng(0)
     xyz = rng.random((500, 3)) * [1.0, 0.1, 0.1]

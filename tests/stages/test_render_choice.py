@@ -6,7 +6,7 @@ from part_scene import angle_deg, box, motion, photograph, two_states
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.registration import part_points, register
-from splatart_ns.stages.render_choice import choose, initial_motion
+from splatart_ns.stages.render_choice import choose, initial_motion, prefer_slide
 from splatart_ns.stages.visibility import visibility
 
 TRUTH = motion((0, 0, 70), (0.3, 0.2, 0.1))
@@ -90,3 +90,10 @@ def test_a_few_gaussians_of_a_sliver_are_enough():
     found = initial_motion(splats, views, seen, part=2)
     centre = torch.tensor([0.4, 0.0, 0.3, 1.0], dtype=torch.float64)
     assert ((found.T - T) @ centre)[:3].norm() < 0.01
+
+
+def test_a_slide_that_fits_nearly_as_well_is_preferred_to_turning_over():
+    T = np.stack([motion(turn, (0, 0, 0)).numpy() for turn in ((0, 178, 0), (0, 0, 60), (0, 0, 2))])
+    assert prefer_slide(T, np.array([1.0, 1.05, 1.15]), [0, 1, 2]) == [2, 0, 1]
+    assert prefer_slide(T, np.array([1.0, 1.05, 1.3]), [0, 1, 2]) == [0, 1, 2]
+    assert prefer_slide(T, np.array([1.1, 1.0, 1.15]), [1, 0, 2]) == [1, 0, 2]

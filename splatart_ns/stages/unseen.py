@@ -1,0 +1,57 @@
+"""Parts that no image shows in some states: what is known of their motions, and where they are put.
+
+A pose whose covariance is not finite is unknown. Two parts are compared in the states in which both are known. Where
+one of them is not known at state 0, the first such state takes its place: the child is put where it was then relative
+to its parent, and its joint has the same value. In other unknown states it moves with its parent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from splatart_ns.geometry.se3 import inverse
+from splatart_ns.stages.articulate import KinematicTree
+
+
+def known_states(motions: Mapping[int, Tensor], covariances: Mapping[int, Tensor] | None) -> dict[int, Tensor]:
+    """Of each part [S] bool, from covariances [S, 6, 6]; all if there are none."""
+    if covariances is None:
+        return {p: torch.ones(len(T), dtype=torch.bool, device=T.device) for p, T in motions.items()}
+    return {p: covariances[p].isfinite().flatten(1).all(-1) for p in motions}
+
+
+def relative_motion(T_a: Tensor, T_b: Tensor, known_a: Tensor, known_b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """How part b moves relative to part a, from their motions [S, 4, 4] and what is known of them [S].
+
+    Returns:
+        The motions [S, 4, 4], the first the identity; where b is to be put at state 0 first, [4, 4] in the canonical
+        frame; and which of the motions say something [S].
+    """
+    known = known_a & known_b
+    R, eye = inverse(T_a) @ T_b, torch.eye(4).to(T_b)
+    if known.all():
+        return R, eye, known
+    place = eye
+    if not known[0] and known.any():
+        first = int(known.int().argmax())
+        place = R[first]
+        known = known & (torch.arange(len(known), device=known.device) != first)
+    return torch.where(known[:, None, None], R @ inverse(place), eye), place, known
+
+
+def place_unseen(
+    tree: KinematicTree, motions: Mapping[int, Tensor], known: Mapping[int, Tensor]
+) -> tuple[dict[int, Tensor], dict[int, Tensor], dict[int, Tensor]]:
+    """Where the parts of a tree are put at state 0, [4, 4] by part; their motions from there [S, 4, 4], those that are
+    unknown being their parents'; and which of these say something [S]."""
+    places = {p: torch.eye(4).to(T) for p, T in motions.items()}
+    motions, known = dict(motions), dict(known)
+    for joint in tree.joints:
+        a, b = joint.parent, joint.child
+        if not known[b].all():
+            R, places[b], known[b] = relative_motion(motions[a], motions[b], torch.ones_like(known[b]), known[b])
+            motions[b] = motions[a] @ R
+    return places, motions, known

@@ -1,0 +1,90 @@
+import pytest
+import torch
+from part_scene import box, motion
+
+from splatart_ns.geometry.se3 import inverse, transform_points
+from splatart_ns.stages.tree import infer_tree
+from splatart_ns.stages.unseen import place_unseen, relative_motion
+
+EYE = torch.eye(4, dtype=torch.float64)
+YES = torch.ones(3, dtype=torch.bool)
+HIDDEN_FIRST = torch.tensor([False, True, True])
+
+
+def about(T: torch.Tensor, at: tuple[float, float, float]) -> torch.Tensor:
+    shift = motion((0, 0, 0), at)
+    return shift @ T @ inverse(shift)
+
+
+def scene(turntable: bool):
+    """A foot, a body that may turn on it, a door and a drawer in the body; the drawer's motions count from state 1."""
+    size = {
+        1: ((1.2, 1.2, 0.06), -0.35),
+        2: ((0.8, 0.8, 0.6), 0.0),
+        3: ((0.04, 0.7, 0.5), 0.0),
+        4: ((0.5, 0.5, 0.2), 0.0),
+    }
+    centre = {1: (0.0, 0.0), 2: (0.0, 0.0), 3: (0.43, 0.0), 4: (0.1, 0.0)}
+    points = {p: box(1, s, (*centre[p], z)).means.double() for p, (s, z) in size.items()}
+    body = torch.stack([EYE, *(motion((0, 0, a if turntable else 0), (0, 0, 0)) for a in (30, -20))])
+    door = torch.stack([EYE, *(about(motion((0, 0, a), (0, 0, 0)), (0.43, 0.37, 0.0)) for a in (100, 60))])
+    drawer = torch.stack([motion((0, 0, 0), (x, 0, 0)) for x in (0.0, 0.15, 0.4)])
+    motions = {1: EYE.repeat(3, 1, 1), 2: body, 3: body @ door, 4: body @ drawer}
+    motions[2] = body if turntable else EYE.repeat(3, 1, 1)
+    # What the pose stage hands on: the drawer's points where they are at state 1, and motions since then.
+    points[4] = transform_points(motions[4][1], points[4])
+    motions[4] = torch.cat([EYE[None], motions[4][1:] @ inverse(motions[4][1])])
+    covariances = {p: 1e-8 * torch.eye(6).double().repeat(3, 1, 1) for p in points}
+    covariances[4][0] = torch.nan
+    return points, motions, covariances
+
+
+@pytest.mark.parametrize("turntable", [False, True])
+def test_a_drawer_hidden_at_state_0_hangs_where_it_slides(turntable):
+    points, motions, covariances = scene(turntable)
+    tree = infer_tree(points, motions, covariances=covariances, root=1)
+    joint = {j.child: j for j in tree.joints}[4]
+    assert joint.fit.type == "prismatic"
+    if turntable:
+        assert joint.parent == 2
+    assert abs(float(joint.fit.axis[0])) > 0.999
+    assert torch.allclose(joint.fit.values.abs(), torch.tensor([0.0, 0.0, 0.25]).double(), atol=5e-3)
+
+
+def test_what_is_not_seen_at_state_0_is_put_where_it_was_in_its_parent():
+    points, motions, covariances = scene(turntable=True)
+    tree = infer_tree(points, motions, covariances=covariances, root=1)
+    known = {p: C.isfinite().flatten(1).all(-1) for p, C in covariances.items()}
+    places, placed, _ = place_unseen(tree, motions, known)
+    assert all(torch.equal(places[p], EYE) for p in (1, 2, 3))
+    assert torch.equal(placed[4][0], EYE)
+    for s in (1, 2):  # what is moved there is where it was seen
+        assert torch.allclose(placed[4][s] @ places[4], motions[4][s], atol=1e-9)
+    in_parent = transform_points(inverse(motions[2][1]), points[4])
+    assert torch.allclose(transform_points(places[4], points[4]), in_parent, atol=1e-6)
+
+
+def test_a_part_seen_in_one_state_alone_has_no_joint_that_is_sure():
+    points, motions, covariances = scene(turntable=False)
+    covariances[4][2], motions[4][2] = torch.nan, EYE
+    tree = infer_tree(points, motions, covariances=covariances, root=1)
+    fit = {j.child: j.fit for j in tree.joints}[4]
+    assert fit.type == "fixed" and len(fit.undetermined) == 2
+
+
+def test_in_a_later_state_that_hides_a_part_it_moves_with_its_parent():
+    a = torch.stack([EYE, motion((0, 0, 20), (0, 0, 0)), motion((0, 0, 50), (0.1, 0, 0))])
+    slide = torch.stack([motion((0, 0, 0), (x, 0, 0)) for x in (0.0, 0.3, 0.1)])
+    known = torch.tensor([True, True, False])
+    b = a @ slide
+    b[2] = EYE
+    R, place, said = relative_motion(a, b, YES, known)
+    assert torch.equal(place, EYE) and said.tolist() == [True, True, False]
+    assert torch.allclose(R[1], slide[1]) and torch.equal(R[2], EYE)
+
+
+def test_motions_that_are_all_known_are_only_compared():
+    a = torch.stack([EYE, motion((0, 0, 20), (0, 0, 0)), motion((0, 0, 50), (0.1, 0, 0))])
+    R, place, said = relative_motion(a, a @ motion((5, 0, 0), (0, 1, 0)), YES, YES)
+    assert torch.equal(place, EYE) and said.all()
+    assert torch.allclose(R, motion((5, 0, 0), (0, 1, 0)).expand(3, 4, 4))
