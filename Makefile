@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint clean
+.PHONY: demo test fuzz lint clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -18,6 +18,9 @@ test: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pytest
+
+fuzz: $(READY)
+	SPLATART_FUZZ_EXAMPLES=2000 $(BIN)/pytest tests/capture/test_fuzz.py tests/bundle/test_fuzz.py
 
 lint: $(READY)
 	$(BIN)/ruff check --fix .

@@ -207,20 +207,65 @@ def export(
         raise SystemExit(1)
 
 
-def check(capture: Annotated[Path, tyro.conf.Positional]) -> None:
+def import_capture(
+    sources: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    output_dir: Path | None = None,
+    labels: Path | None = None,
+    in_place: bool = False,
+) -> None:
+    """Make a capture of other tools' folders: labels of annotation tools, and results of ns-process-data as states.
+
+    Args:
+        sources: Folder of a capture; or of each state, with a transforms.json each, in the states' order.
+        output_dir: Folder of the new capture; it does not exist yet, or is empty.
+        labels: What the annotation tool exported: COCO segmentation, YOLO polygons with data.yaml, or mask PNGs with
+            _classes.csv; a file or a folder.
+        in_place: Write the labels into the capture itself.
+    """
+    from splatart_ns.capture import label_import
+
+    if not sources or in_place == (output_dir is not None) or (in_place and (len(sources) > 1 or labels is None)):
+        raise InputError("Give --output-dir; or one capture, --labels and --in-place to write into the capture itself.")
+    if len(sources) == 1 and labels is None:
+        raise InputError(f"{sources[0]} alone leaves nothing to import; give --labels, or the folders of more states.")
+    if in_place:
+        done = label_import.import_labels(sources[0], labels)
+    else:
+        done = label_import.import_capture(sources, output_dir, labels)
+    if done is not None:
+        print(f"Labels: {done.format}, {done.labelled} of {done.frames} frames; parts: {', '.join(done.parts)}")
+        if done.unmatched:
+            names = ", ".join(done.unmatched[:3]) + (", ..." if len(done.unmatched) > 3 else "")
+            print(f"No frame has the name of {len(done.unmatched)} labelled images: {names}")
+    print(f"Capture: {output_dir or sources[0]}")
+
+
+def check(
+    capture: Annotated[Path, tyro.conf.Positional],
+    suggest: int = 0,
+    sheet: Path | None = None,
+    json: bool = False,
+) -> None:
     """Say what is wrong with a capture, frame by frame, and how to mend it.
+
+    The exit code is 2 if there are errors, so that it cannot be fitted, and 0 if there are none, or warnings alone.
 
     Args:
         capture: Folder of the capture.
+        suggest: Name so many training frames that would help most to label next.
+        sheet: Write a PNG of the frames with their labels, problems marked.
+        json: Print JSON instead of text.
     """
-    from splatart_ns.capture.check import check_capture
+    from splatart_ns.capture.contact_sheet import write_contact_sheet
+    from splatart_ns.capture.examination import as_json, as_text, examine
 
-    problems = check_capture(capture)
-    for problem in problems:
-        print(f"{problem.severity}: {problem}")
-    errors = sum(problem.severity == "error" for problem in problems)
-    print(f"{errors} errors, {len(problems) - errors} warnings")
-    if errors:
+    if suggest < 0 or (sheet is not None and sheet.suffix.lower() != ".png"):
+        raise InputError(f"--suggest is {suggest} and --sheet {sheet}; give 0 or more frames, and a .png file.")
+    examination = examine(capture, suggest)
+    if sheet is not None and examination.capture is not None:
+        write_contact_sheet(sheet, examination.capture, examination.problems, examination.suggested)
+    print(as_json(examination) if json else as_text(examination))
+    if examination.errors:
         raise SystemExit(2)
 
 
@@ -287,18 +332,12 @@ def _device() -> str:
 
 def main() -> None:
     """Run the command line. A user's mistake gets one sentence and exit code 2."""
+    sys.stdout.reconfigure(errors="backslashreplace")  # file names need not be UTF-8
     # Nerfstudio's own, which its users cannot mend.
     warnings.filterwarnings("ignore", category=FutureWarning)
     warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True")
-    commands = {
-        "fit": fit,
-        "render": render,
-        "eval": evaluate,
-        "check": check,
-        "export": export,
-        "synth": synth,
-        "demo": demo,
-    }
+    commands = {"fit": fit, "render": render, "eval": evaluate, "check": check, "import": import_capture}
+    commands |= {"export": export, "synth": synth, "demo": demo}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="splatart", description=__doc__)
     except InputError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -22,7 +23,7 @@ class Record:
         self.fields: dict[str, Any] = value
 
     def fail(self, key: str, found: str, mend: str) -> NoReturn:
-        raise InputError(f"{self.path}: '{key}' of {self.where} {found}; {mend}")
+        raise InputError(f"{self.path}: '{key}' of {self.where} {found}; {mend}".replace("\n", "\\n"))
 
     def _get(self, key: str, kind: type | tuple[type, ...], word: str) -> Any:
         if key not in self.fields:
@@ -93,6 +94,8 @@ def _shown(value: Any) -> str:
 
 def read_record(path: Path, mend: str) -> Record:
     """The JSON object in a file; `mend` says what to do where there is no such file."""
+    if os.path.exists(path) and not os.path.isfile(path):  # a pipe would never end
+        raise InputError(f"{path}: is not a file; {mend}")
     try:
         value = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_constant)
     except OSError as error:

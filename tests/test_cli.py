@@ -54,11 +54,19 @@ def test_help_names_every_command(start_splatart):
     process = start_splatart("--help")
     output, errors = process.communicate()
     assert (process.returncode, errors) == (0, "")
-    assert all(f"• {command} " in output for command in ("fit", "render", "eval", "check", "export", "synth", "demo"))
+    assert all(
+        f"• {command} " in output for command in ("fit", "render", "eval", "check", "import", "export", "synth", "demo")
+    )
 
 
 def test_check_has_nothing_to_say_about_a_sound_capture(run_main, hinge_capture):
-    assert run_main("check", hinge_capture) == (0, "0 errors, 0 warnings\n", "")
+    code, output, errors = run_main("check", hinge_capture)
+    assert (code, errors) == (0, "")
+    assert [line.split() for line in output.splitlines()[1:]] == [
+        ["base", "12", "of", "12", "12", "of", "12"],
+        ["lid", "12", "of", "12", "12", "of", "12"],
+        ["0", "errors,", "0", "warnings"],
+    ]
 
 
 def test_check_tells_all_problems(run_main, hinge_capture, tmp_path):
@@ -67,7 +75,7 @@ def test_check_tells_all_problems(run_main, hinge_capture, tmp_path):
     (capture / "state_01/images/0004.png").write_bytes(b"no picture")
     code, output, errors = run_main("check", capture)
     assert code == 2 and errors == ""
-    first, second, last = output.splitlines()
+    first, second, *_, last = output.splitlines()
     assert first.startswith(f"error: {capture / 'state_00/images/0001.png'}: the file does not exist; ")
     assert second.startswith(f"error: {capture / 'state_01/images/0004.png'}: ")
     assert last == "2 errors, 0 warnings"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -146,8 +147,12 @@ def _read_part(record: Record, num_states: int, folder: Path) -> Part:
 def _read_splat(record: Record, folder: Path) -> Splat:
     relative = record.text("splat")
     path = folder / relative
-    if "\0" in relative or not path.resolve().is_relative_to(folder.resolve()):
-        record.fail("splat", f"is '{relative}'", "give a path inside the bundle's folder")
+    try:
+        inside = Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+    except (OSError, ValueError):  # too long, or with a null byte
+        inside = False
+    if not inside:
+        record.fail("splat", f"is {relative!r}", "give a path inside the bundle's folder")
     return read_ply(path)
 
 

@@ -22,12 +22,12 @@ def check_capture(path: Path | str) -> list[Problem]:
 
     Every file is decoded once. Never raises for what is in the capture.
     """
-    return _check(Path(path))[1]
+    return check_structure(Path(path))[1]
 
 
 def require_valid(path: Path | str) -> Capture:
     """Load and check a capture. Raises `InputError` with the first error, and how many there are."""
-    capture, problems = _check(Path(path))
+    capture, problems = check_structure(Path(path))
     errors = [p for p in problems if p.severity == "error"]
     if errors or capture is None:
         more = f" (and {len(errors) - 1} more, see `splatart check {path}`)" if len(errors) > 1 else ""
@@ -35,7 +35,8 @@ def require_valid(path: Path | str) -> Capture:
     return capture
 
 
-def _check(path: Path) -> tuple[Capture | None, list[Problem]]:
+def check_structure(path: Path) -> tuple[Capture | None, list[Problem]]:
+    """What can be read of a capture, None for nothing, and what `check_capture` says of it."""
     problems: list[Problem] = []
     try:
         capture = read_capture(path, problems.append)
@@ -58,12 +59,15 @@ def _check(path: Path) -> tuple[Capture | None, list[Problem]]:
     return capture, list(dict.fromkeys(problems))
 
 
+_NO_PIXELS = np.zeros(256, int)
+
+
 @dataclass
 class _Content:
     """What a frame's files hold."""
 
     problems: list[Problem] = field(default_factory=list)
-    pixels: np.ndarray = field(default_factory=lambda: np.zeros(256, int))
+    pixels: np.ndarray = field(default_factory=lambda: _NO_PIXELS)
     """Number of pixels of each label [256]."""
     silhouette: float | None = None
     """The part of the image inside the silhouette, if the frame has one."""

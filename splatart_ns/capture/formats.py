@@ -6,14 +6,12 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from splatart_ns.capture.capture import (
-    UNLABELLED,
     Capture,
     CaptureError,
     Frame,
@@ -22,9 +20,20 @@ from splatart_ns.capture.capture import (
     Report,
     State,
 )
-from splatart_ns.capture.images import MAX_LABEL, image_size, read_labels
-from splatart_ns.capture.values import parse_camera, parse_matrix, parse_pose, read_json, relative_path, show
+from splatart_ns.capture.images import image_size
+from splatart_ns.capture.part_names import read_part_names
+from splatart_ns.capture.values import (
+    inner_path,
+    is_inside,
+    parse_camera,
+    parse_matrix,
+    parse_pose,
+    read_json,
+    relative_path,
+    show,
+)
 
+TRANSFORMS = "transforms.json"
 SPLITS = ("train", "val", "test")
 _PARIS_STATES = ("start", "end")
 
@@ -59,7 +68,14 @@ def load_novel(path: Path | str) -> tuple[State, ...]:
     Raises `InputError` as `load_capture` does.
     """
     folders = _subfolders(Path(path) / "eval")
-    return tuple(_read_state(folder, _raise)[0] for folder in folders if folder.name.startswith("novel"))
+    return tuple(_read_state(f, Path(path), _raise)[0] for f in folders if f.name.startswith("novel"))
+
+
+def load_states(folders: Sequence[Path]) -> tuple[State, ...]:
+    """Folders with a transforms.json each, as the states of one capture. Raises `InputError` as `load_capture` does."""
+    read = [_read_state(Path(folder), Path(folder), _raise) for folder in folders]
+    read_part_names([meta for _, meta in read], [frame for state, _ in read for frame in state.frames], _raise)
+    return tuple(state for state, _ in read)
 
 
 def read_capture(path: Path | str, report: Report) -> Capture:
@@ -71,7 +87,7 @@ def read_capture(path: Path | str, report: Report) -> Capture:
     if not path.is_dir():
         raise CaptureError(path, "the capture is not a folder", "give the folder that holds the states")
     folders = [f for f in _subfolders(path) if f.name != "eval"]
-    single = os.path.isfile(path / "transforms.json")
+    single = os.path.isfile(path / TRANSFORMS)
     if folders and single:
         raise CaptureError(
             path,
@@ -79,11 +95,11 @@ def read_capture(path: Path | str, report: Report) -> Capture:
             'keep either the state folders, or one file whose frames carry "state"',
         )
     if folders:
-        states, metas = _read_folders(folders, report)
+        states, metas = _read_folders(folders, path, report)
     elif single:
-        states, metas = _read_single(path / "transforms.json", report)
+        states, metas = _read_single(path / TRANSFORMS, report)
     elif all(os.path.isfile(path / state / "camera_train.json") for state in _PARIS_STATES):
-        states, metas = [_read_paris(path / state, report) for state in _PARIS_STATES], []
+        states, metas = [_read_paris(path / state, path, report) for state in _PARIS_STATES], []
     else:
         raise CaptureError(
             path,
@@ -102,7 +118,7 @@ def read_capture(path: Path | str, report: Report) -> Capture:
     return Capture(
         path=path,
         states=tuple(states),
-        parts=_part_names(metas, frames, report),
+        parts=read_part_names(metas, frames, report),
         length_unit=next((unit for _, m in metas if isinstance(unit := m.get("length_unit"), str)), "unknown"),
         normalization=Normalization.from_cameras(
             np.stack([f.T_world_camera for f in frames]),
@@ -118,7 +134,7 @@ def _subfolders(path: Path) -> list[Path]:
     """The folders in `path` that hold a transforms.json, in natural order: state_2 before state_10."""
     if not path.is_dir():
         return []
-    found = [f for f in path.iterdir() if not f.name.startswith(".") and os.path.isfile(f / "transforms.json")]
+    found = [f for f in path.iterdir() if not f.name.startswith(".") and os.path.isfile(f / TRANSFORMS)]
 
     def key(folder: Path) -> tuple[list[str | int], str]:
         pieces = re.split(r"(\d+)", folder.name)  # digits, and only they, at the odd places
@@ -130,11 +146,11 @@ def _subfolders(path: Path) -> list[Path]:
 _Meta = tuple[Path, dict[str, Any]]
 
 
-def _read_folders(folders: Sequence[Path], report: Report) -> tuple[list[State], list[_Meta]]:
+def _read_folders(folders: Sequence[Path], root: Path, report: Report) -> tuple[list[State], list[_Meta]]:
     states, metas = [], []
     for folder in folders:
         try:
-            state, meta = _read_state(folder, report)
+            state, meta = _read_state(folder, root, report)
         except CaptureError as error:
             report(error.problem)
             continue
@@ -143,15 +159,15 @@ def _read_folders(folders: Sequence[Path], report: Report) -> tuple[list[State],
     return states, metas
 
 
-def _read_state(folder: Path, report: Report) -> tuple[State, _Meta]:
-    file = folder / "transforms.json"
-    meta = read_json(file)
-    (frames,) = _read_frames(file, meta, {0: _entries(file, meta)}, report).values()
-    return State(folder.name, frames, _points(file, meta)), (file, meta)
+def _read_state(folder: Path, root: Path, report: Report) -> tuple[State, _Meta]:
+    file = folder / TRANSFORMS
+    meta = _read_inside(file, root)
+    (frames,) = _read_frames(file, root, meta, {0: _entries(file, meta)}, report).values()
+    return State(folder.name, frames, _points(file, root, meta)), (file, meta)
 
 
 def _read_single(file: Path, report: Report) -> tuple[list[State], list[_Meta]]:
-    meta = read_json(file)
+    meta = _read_inside(file, file.parent)
     entries = _entries(file, meta)
     if not any(isinstance(entry, dict) and "state" in entry for entry in entries):
         mend = 'give every frame "state": 0, 1, ..., or name the folder that holds the state folders'
@@ -164,19 +180,19 @@ def _read_single(file: Path, report: Report) -> tuple[list[State], list[_Meta]]:
             report(Problem("error", file, f"frame {i} {found}", 'give every frame "state": 0, 1, ... as a number'))
             continue
         groups.setdefault(k, []).append(entry)
-    points = _points(file, meta)
-    frames = _read_frames(file, meta, dict(sorted(groups.items())), report)
+    points = _points(file, file.parent, meta)
+    frames = _read_frames(file, file.parent, meta, dict(sorted(groups.items())), report)
     return [State(f"state_{k:02d}", f, points) for k, f in frames.items()], [(file, meta)]
 
 
-def _read_paris(folder: Path, report: Report) -> State:
+def _read_paris(folder: Path, root: Path, report: Report) -> State:
     frames: list[Frame] = []
     for split in SPLITS:
         file = folder / f"camera_{split}.json"
         if not os.path.isfile(file):
             continue
         try:
-            cameras = read_json(file)
+            cameras = _read_inside(file, root)
             K = parse_matrix(file, "K", cameras.get("K"), ((3, 3), (4, 4)))
         except CaptureError as error:
             report(error.problem)
@@ -185,15 +201,15 @@ def _read_paris(folder: Path, report: Report) -> State:
             if name == "K":
                 continue
             try:
-                frames.append(_paris_frame(file, split, name, pose, K))
+                frames.append(_paris_frame(file, root, split, name, pose, K))
             except CaptureError as error:
                 report(error.problem)
     return State(folder.name, tuple(frames))
 
 
-def _paris_frame(file: Path, split: str, name: str, pose: Any, K: np.ndarray) -> Frame:
-    image = file.parent / relative_path(file, "an image name", f"{split}/{name}.png")
-    labels = file.parent / f"{split}_semantics/{name}.png"
+def _paris_frame(file: Path, root: Path, split: str, name: str, pose: Any, K: np.ndarray) -> Frame:
+    image = inner_path(file, root, "an image name", f"{split}/{name}.png")
+    labels = inner_path(file, root, "an image name", f"{split}_semantics/{name}.png")
     width, height = image_size(image)
     values = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": width, "h": height}
     return Frame(
@@ -209,6 +225,12 @@ def _paris_frame(file: Path, split: str, name: str, pose: Any, K: np.ndarray) ->
 # ---------------------------------------------------------------------------------------------- transforms.json
 
 
+def _read_inside(file: Path, root: Path) -> dict[str, Any]:
+    if not is_inside(root, file):
+        raise CaptureError(file, "it is a link out of the capture", "copy what it leads to into the capture")
+    return read_json(file)
+
+
 def _entries(file: Path, meta: dict[str, Any]) -> list[Any]:
     entries = meta.get("frames")
     if not isinstance(entries, list) or not entries:
@@ -218,7 +240,7 @@ def _entries(file: Path, meta: dict[str, Any]) -> list[Any]:
 
 
 def _read_frames(
-    file: Path, meta: dict[str, Any], groups: dict[int, list[Any]], report: Report
+    file: Path, root: Path, meta: dict[str, Any], groups: dict[int, list[Any]], report: Report
 ) -> dict[int, tuple[Frame, ...]]:
     """The frames of each group of entries, sorted by name; entries that cannot be read are reported and left out."""
     named: dict[int, list[tuple[str, dict[str, Any]]]] = {}
@@ -239,19 +261,21 @@ def _read_frames(
         for name, entry in pairs:
             try:
                 if name in splits:
-                    read.append(_frame(file, name, meta, entry, splits[name]))
+                    read.append(_frame(file, root, name, meta, entry, splits[name]))
             except CaptureError as error:
                 report(error.problem)
         frames[k] = tuple(read)
     return frames
 
 
-def _frame(file: Path, name: str, meta: dict[str, Any], entry: dict[str, Any], split: str) -> Frame:
+def _frame(file: Path, root: Path, name: str, meta: dict[str, Any], entry: dict[str, Any], split: str) -> Frame:
+    owner = f"frame {name!r}"
+
     def optional(key: str) -> Path | None:
         value = entry.get(key)
-        return None if value is None else file.parent / relative_path(file, f"{key} of frame {name!r}", value)
+        return None if value is None else inner_path(file, root, f"{key} of {owner}", value)
 
-    owner, image = f"frame {name!r}", file.parent / name
+    image = inner_path(file, root, f"file_path of {owner}", name)
     return Frame(
         name=name,
         image=image,
@@ -286,78 +310,9 @@ def _splits(file: Path, meta: dict[str, Any], groups: Sequence[Sequence[str]], r
     return {name: split for split in ("val", "test", "train") for name in listed[split] & names}
 
 
-def _points(file: Path, meta: dict[str, Any]) -> Path | None:
+def _points(file: Path, root: Path, meta: dict[str, Any]) -> Path | None:
     value = meta.get("ply_file_path")
-    return None if value is None else file.parent / relative_path(file, "ply_file_path", value)
-
-
-# ---------------------------------------------------------------------------------------------- parts
-
-
-def _part_names(metas: Sequence[_Meta], frames: Sequence[Frame], report: Report) -> dict[int, str]:
-    named: tuple[Path, list[str]] | None = None
-    for file, meta in metas:
-        try:
-            classes = _classes(file, meta)
-        except CaptureError as error:
-            report(error.problem)
-            continue
-        if classes is not None and named is not None and classes != named[1]:
-            mend = f"use the list of {named[0]} in all states"
-            report(Problem("error", file, "semantic_classes differs from another state's", mend))
-        elif classes is not None:
-            named = named or (file, classes)
-    if named is not None:
-        return {i + 1: name for i, name in enumerate(safe_names(named[1]))}
-    return {i: f"part_{i}" for i in range(1, _largest_label(frames, report) + 1)}
-
-
-def _classes(file: Path, meta: dict[str, Any]) -> list[str] | None:
-    classes = meta.get("semantic_classes")
-    if classes is None:
-        return None
-    if not isinstance(classes, list) or not classes or not all(isinstance(c, str) for c in classes):
-        raise CaptureError(
-            file, f"semantic_classes is {show(classes)}", 'write a list of names, "background" first, then the parts'
-        )
-    if classes[0].lower() not in ("background", "bg"):
-        raise CaptureError(
-            file, f"semantic_classes begins with {show(classes[0])}", 'put "background" first: it is the label 0'
-        )
-    if len(classes) - 1 > MAX_LABEL:
-        raise CaptureError(file, f"semantic_classes has {len(classes) - 1} parts", f"name at most {MAX_LABEL}")
-    return classes[1:]
-
-
-def safe_names(names: Sequence[str]) -> list[str]:
-    """Names that can be file names everywhere: of [A-Za-z0-9_.-], and unique even where case does not count."""
-    out: list[str] = []
-    taken: set[str] = set()
-    for i, name in enumerate(names):
-        base = re.sub(r"[^A-Za-z0-9_.-]+", "_", name)[:64].lstrip(".-").rstrip(".") or f"part_{i + 1}"
-        safe, n = base, 1
-        while safe.lower() in taken:
-            n += 1
-            safe = f"{base}_{n}"
-        taken.add(safe.lower())
-        out.append(safe)
-    return out
-
-
-def _largest_label(frames: Sequence[Frame], report: Report) -> int:
-    def largest(path: Path) -> int | Problem:
-        try:
-            labels = read_labels(path)
-        except CaptureError as error:
-            return error.problem
-        return int(labels[labels != UNLABELLED].max(initial=0))
-
-    with ThreadPoolExecutor() as pool:
-        found = list(pool.map(largest, [f.labels for f in frames if f.labels is not None]))
-    for problem in found:
-        if isinstance(problem, Problem):
-            report(problem)
-    return max((label for label in found if isinstance(label, int)), default=0)
+    return None if value is None else inner_path(file, root, "ply_file_path", value)
 
 
 def _raise(problem: Problem) -> None:

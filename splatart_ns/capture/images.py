@@ -5,6 +5,7 @@ All readers raise `InputError` when the file is missing, damaged or not of the k
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 from collections.abc import Callable
@@ -13,15 +14,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 
 from splatart_ns.capture.capture import UNLABELLED, Camera, CaptureError
 from splatart_ns.errors import InputError
+from splatart_ns.files import replacing
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
 _PNG_COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGBA"}
 _HALF = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])  # OpenCV's pixel centres lie at integers
 MAX_LABEL = UNLABELLED - 1
+_MOST_BYTES, _MOST_PIXELS = 1 << 30, 1 << 27
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -29,7 +33,7 @@ def read_image(path: Path) -> np.ndarray:
 
     Grey images are repeated over the channels, 16-bit values are divided by 257.
     """
-    pixels = _to_bytes(path, _decode(path, _read_bytes(path)))
+    pixels = _to_bytes(path, _decode(path, read_bytes(path)))
     if pixels.ndim == 2:
         return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB)
     return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
@@ -37,7 +41,7 @@ def read_image(path: Path) -> np.ndarray:
 
 def read_labels(path: Path) -> np.ndarray:
     """Part ids, uint8 [H, W]: 0 background, 1..254 parts, 255 unlabelled; from a one-channel PNG of 8 or 16 bits."""
-    data = _read_bytes(path)
+    data = read_bytes(path)
     if not data.startswith(_PNG) or len(data) < 33:
         raise CaptureError(path, "labels are not a PNG file", "save the part ids as a one-channel 8- or 16-bit PNG")
     bits, colour_type = data[24], data[25]
@@ -62,7 +66,7 @@ def read_labels(path: Path) -> np.ndarray:
 
 def read_mask(path: Path) -> np.ndarray:
     """A silhouette or a mask, uint8 [H, W], 0 outside and 255 inside; masks of 0 and 1 are stretched to 0 and 255."""
-    mask = _to_bytes(path, _decode(path, _read_bytes(path)))
+    mask = _to_bytes(path, _decode(path, read_bytes(path)))
     if mask.ndim == 3:
         if not (mask[..., :1] == mask[..., :3]).all():
             raise CaptureError(path, "the mask is a colour image", "save it with one grey channel")
@@ -77,21 +81,30 @@ def read_depth(path: Path, unit: float = 1e-3) -> np.ndarray:
     one count (nerfstudio's `depth_unit_scale_factor`: millimetres in a world of metres).
     """
     if path.suffix.lower() == ".npy":
-        try:
-            depth = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
+        if not os.path.isfile(path):
+            raise CaptureError(path, "the file does not exist", "add it or correct its path")
+        try:  # mapped, so that a header that promises more than the file holds takes no memory
+            depth = np.load(path, mmap_mode="r", allow_pickle=False)
+        except Exception as error:  # numpy lets whatever its parsers meet through
             raise CaptureError(path, f"the depth cannot be read ({error})", "save it again with numpy.save") from None
         if not isinstance(depth, np.ndarray) or depth.dtype.kind not in "fiu":
             raise CaptureError(path, "the depth is not an array of numbers", "save it as float32 with numpy.save")
     else:
-        depth = _decode(path, _read_bytes(path))
+        depth = _decode(path, read_bytes(path))
         if depth.dtype == np.uint8:
             raise CaptureError(path, "the depth image has 8 bits", "save the depth as a 16-bit PNG in millimetres")
     if depth.ndim == 3 and depth.shape[2] == 1:
         depth = depth[..., 0]
-    if depth.ndim != 2:
+    if depth.ndim != 2 or depth.size > _MOST_PIXELS:
         raise CaptureError(path, f"the depth has the shape {depth.shape}", "save it with one channel")
     return np.nan_to_num(depth.astype(np.float32) * np.float32(unit), nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write grey, BGR or BGRA pixels (uint8 or uint16), making the folder where it is missing."""
+    with replacing(path) as temporary:
+        if not cv2.imwrite(str(temporary), image):
+            raise InputError(f"{path}: the image cannot be written; check the space on the disk.")
 
 
 def read_sized(path: Path, reader: Callable[[Path], np.ndarray], camera: Camera) -> np.ndarray:
@@ -109,9 +122,10 @@ def read_sized(path: Path, reader: Callable[[Path], np.ndarray], camera: Camera)
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image; of a PNG without decoding it."""
-    data = _read_bytes(path, 24)
+    data = read_bytes(path, 24)
     if data.startswith(_PNG) and len(data) == 24:
-        return struct.unpack(">II", data[16:24])
+        width, height = struct.unpack(">II", data[16:24])
+        return width, height
     height, width = read_image(path).shape[:2]
     return width, height
 
@@ -168,21 +182,35 @@ def downscale_labels(labels: np.ndarray, factor: int) -> np.ndarray:
     return np.ascontiguousarray(labels[factor // 2 :: factor, factor // 2 :: factor][:h, :w])
 
 
-def _read_bytes(path: Path, size: int = -1) -> bytes:
+def read_bytes(path: Path, size: int = _MOST_BYTES + 1) -> bytes:
+    """The first `size` bytes of a file, or all of at most 1 GiB."""
     if not os.path.isfile(path):
         raise CaptureError(path, "the file does not exist", "add it or correct its path")
     try:
         with open(path, "rb") as file:
-            return file.read(size)
+            data = file.read(size)
     except OSError as error:
         raise CaptureError(path, f"the file cannot be read ({error.strerror})", "make it readable") from None
+    if len(data) > _MOST_BYTES:
+        raise CaptureError(path, "the file is larger than 1 GiB", "save it as a PNG or JPEG")
+    return data
 
 
 def _decode(path: Path, data: bytes) -> np.ndarray:
+    try:  # the size that the header promises, before OpenCV makes room for it
+        width, height = PIL.Image.open(io.BytesIO(data)).size
+    except PIL.Image.DecompressionBombError:
+        width = height = 1 << 16
+    except Exception:  # Pillow lets whatever its parsers meet through
+        width = height = 0
+    if width * height > _MOST_PIXELS:
+        found = f"the image has more than {_MOST_PIXELS >> 20} mega pixels"
+        raise CaptureError(path, found, "scale it down, and its intrinsics with it")
     # OpenCV fills the missing part of a cut-off JPEG with grey; its end marker must follow the last scan's start.
     cut_off = data.startswith(_JPEG) and data.find(b"\xff\xd9", max(data.rfind(b"\xff\xda"), 0)) < 0
     try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data and not cut_off else None
+        known = width > 0 and not cut_off
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if known else None
     except cv2.error:
         pixels = None
     if pixels is None:

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -18,10 +14,12 @@ import numpy as np
 import trimesh
 
 from splatart_ns.capture.capture import Camera
+from splatart_ns.capture.images import write_png
 from splatart_ns.capture.ray_caster import Light, RayCaster
 from splatart_ns.capture.robot import Joint, Robot, read_urdf
 from splatart_ns.capture.scene import Scene, camera_poses, ground_truth
 from splatart_ns.errors import InputError
+from splatart_ns.files import new_folder
 
 POINTS_PER_PART = 10_000
 _TURN = 1.75
@@ -84,7 +82,7 @@ def synthesize(urdf: Path, output_dir: Path, options: SynthesisOptions | None = 
     frozen = _frozen(robot, options)
     configurations = _configurations(robot, frozen, options)
     scene = Scene.of(robot, frozen, configurations)
-    with _new_folder(output_dir) as folder:
+    with new_folder(output_dir) as folder:
         for k, values in enumerate(configurations):
             _write_state(folder / f"state_{k:02d}", scene, values, options, options.train_views, k)
         _write_state(folder / "eval" / "novel_00", scene, scene.novel, options, 0, len(configurations))
@@ -196,11 +194,11 @@ def _write_state(
         seen = caster.render(camera, T, options.light, options.samples)
         name = f"{i:04d}.png"
         frame = {"file_path": f"images/{name}"}
-        _write_png(folder / "images" / name, cv2.cvtColor(seen.rgba, cv2.COLOR_RGBA2BGRA))
+        write_png(folder / "images" / name, cv2.cvtColor(seen.rgba, cv2.COLOR_RGBA2BGRA))
         if i in labelled or i >= train_views:
-            _write_png(folder / "semantics" / name, seen.part_ids)
+            write_png(folder / "semantics" / name, seen.part_ids)
             frame["semantics_path"] = f"semantics/{name}"
-        _write_png(folder / "masks" / name, seen.silhouette.astype(np.uint8) * 255)
+        write_png(folder / "masks" / name, seen.silhouette.astype(np.uint8) * 255)
         frames.append({**frame, "transform_matrix": T.tolist(), "object_mask_path": f"masks/{name}"})
 
     train, test = [f["file_path"] for f in frames[:train_views]], [f["file_path"] for f in frames[train_views:]]
@@ -223,33 +221,8 @@ def _write_state(
     (folder / "transforms.json").write_text(json.dumps(transforms, indent=1) + "\n", encoding="utf-8")
 
 
-def _write_png(path: Path, image: np.ndarray) -> None:
-    if not cv2.imwrite(str(path), image):
-        raise InputError(f"{path}: the image cannot be written; check the space on the disk.")
-
-
 def _write_points(folder: Path, scene: Scene, seed: int) -> None:
     folder.mkdir()
     for i, surface in scene.placed(scene.configurations[0]).items():
         points = surface.sample(POINTS_PER_PART, np.random.default_rng([seed, 2, i]))
         trimesh.PointCloud(points.astype(np.float32)).export(folder / f"part_{i}.ply")
-
-
-@contextmanager
-def _new_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder beside `path`, which takes its place when the block ends well."""
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise InputError(f"{path}: is there already and not empty; give another output folder, or remove it.")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); give another output folder.") from error
-    try:
-        temporary.chmod(0o755)
-        yield temporary
-        if path.exists():
-            path.rmdir()
-        os.replace(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import reprlib
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
@@ -20,14 +21,38 @@ from splatart_ns.errors import InputError
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_MOST_BYTES = 256 << 20
 _LONGEST = 1e12  # a coordinate or focal length beyond this is a mistake, and its square still is a float
+
+
+def read_text(file: Path) -> str:
+    """The text of a file, of at most 256 MiB of UTF-8."""
+    if not os.path.isfile(file):
+        raise CaptureError(file, "the file does not exist", "add it or correct its path")
+    try:
+        with open(file, "rb") as stream:
+            data = stream.read(_MOST_BYTES + 1)
+    except OSError as error:
+        raise CaptureError(file, f"the file cannot be read ({error.strerror})", "make it readable") from None
+    if len(data) > _MOST_BYTES:
+        raise CaptureError(file, "the file is larger than 256 MiB", "give one that describes fewer frames")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise CaptureError(file, "the file is not UTF-8 text", "write it again, or restore a copy") from None
+
+
+def is_inside(folder: Path, path: Path) -> bool:
+    """Whether a path, all links followed, lies in a folder."""
+    try:
+        return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+    except (OSError, ValueError):  # too long, or with a null byte
+        return False
 
 
 def read_json(file: Path) -> dict[str, Any]:
     try:
-        value = json.loads(file.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise CaptureError(file, f"the file cannot be read ({error.strerror})", "make it readable") from None
+        value = json.loads(read_text(file))
     except (ValueError, RecursionError) as error:
         raise CaptureError(file, f"the file is not JSON ({error})", "write it again, or restore a copy") from None
     if not isinstance(value, dict):
@@ -41,6 +66,14 @@ def relative_path(file: Path, what: str, value: Any) -> str:
         found = "is missing" if value is None else f"is {show(value)}"
         raise CaptureError(file, f"{what} {found}", "give the path of a file, from this file's folder")
     return PurePosixPath(value).as_posix()
+
+
+def inner_path(file: Path, root: Path, what: str, value: Any) -> Path:
+    """The file that a path in `file` leads to, from its folder, all links followed: it must lie in `root`."""
+    path = file.parent / relative_path(file, what, value)
+    if not is_inside(root, path):
+        raise CaptureError(file, f"{what} is {show(value)}, outside the capture", "copy the file into the capture")
+    return path
 
 
 def parse_number(file: Path, what: str, value: Any) -> float:

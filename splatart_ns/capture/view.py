@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
@@ -120,10 +121,12 @@ def load_points(path: Path, normalization: Normalization) -> tuple[Tensor, Tenso
 
     Raises `InputError` if it cannot be read or is empty.
     """
-    try:
-        cloud = trimesh.load(path, file_type="ply", process=False)
+    try:  # from bytes: a file could name a texture elsewhere
+        cloud = trimesh.load(io.BytesIO(images.read_bytes(path)), file_type="ply", process=False)
         xyz = np.asarray(cloud.vertices, dtype=np.float64)
         rgb = np.asarray(cloud.visual.vertex_colors)
+    except CaptureError:
+        raise
     except Exception as error:  # trimesh lets whatever its parsers meet through
         found = f"the point cloud cannot be read ({type(error).__name__}: {error})"
         raise CaptureError(path, found, "write it again as a PLY of points, or take ply_file_path out") from None

@@ -6,6 +6,7 @@ of red, then of green, then of blue), opacity (a logit), scale_0..2 (logarithms)
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import BinaryIO
 
@@ -63,7 +64,7 @@ def read_ply(path: Path) -> Splat:
     Raises InputError for anything that is not a whole, finite 3DGS PLY. Properties of other names are skipped.
     """
     path = Path(path)
-    if path.exists() and not path.is_file():  # a pipe would never end
+    if os.path.exists(path) and not os.path.isfile(path):  # a pipe would never end
         raise InputError(f"{path}: is not a file; give a PLY file")
     try:
         with path.open("rb") as file:

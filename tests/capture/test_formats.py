@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from splatart_ns.capture.capture import Normalization
-from splatart_ns.capture.formats import load_capture, load_novel, safe_names
+from splatart_ns.capture.formats import load_capture, load_novel
+from splatart_ns.capture.part_names import safe_names
 from splatart_ns.errors import InputError
 
 FILE = "state_00/transforms.json"

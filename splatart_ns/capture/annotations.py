@@ -1,0 +1,324 @@
+"""Part labels as annotation tools export them: COCO, YOLO polygons, folders of mask PNGs."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from splatart_ns.capture.capture import UNLABELLED, CaptureError
+from splatart_ns.capture.images import MAX_LABEL, image_size, read_labels
+from splatart_ns.capture.rasters import decode_runs, decompress_runs, fill_polygon
+from splatart_ns.capture.values import is_inside, parse_number, read_json, read_text, show
+
+BACKGROUND_NAMES = ("background", "bg")
+UNLABELLED_NAMES = ("unlabelled", "unlabeled", "ignore", "void")
+"""Classes of these names are no parts."""
+_CLASS_LISTS = ("classes.txt", "obj.names", "_darknet.labels")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+
+
+@dataclass(frozen=True)
+class AnnotatedImage:
+    """What an export says of one image."""
+
+    file: Path
+    """The file of the export that says it."""
+    name: str
+    """The image's path as the export spells it."""
+    size: tuple[int, int] | None
+    """Width and height, where the export knows them."""
+    draw: Callable[[int, int], np.ndarray]
+    """The labels of an image of this width and height, uint16 [height, width]: 0 where nothing is drawn, else the place
+    of a class in `Annotations.classes` plus 1. Raises `InputError` for a shape that makes no sense."""
+
+
+@dataclass(frozen=True)
+class Annotations:
+    """One export."""
+
+    format: str
+    classes: tuple[str, ...]
+    images: tuple[AnnotatedImage, ...]
+
+
+def read_annotations(path: Path) -> Annotations:
+    """Read an export: a COCO file, or a folder that holds COCO files, YOLO texts or mask PNGs, at any depth.
+
+    - COCO: `.json` files with `images`, `annotations` and `categories`; polygons, runs, compressed runs.
+    - YOLO: `.txt` files of "class x y x y ..." lines, coordinates from 0 to 1, beside a `data.yaml` or `classes.txt`.
+    - Masks: PNGs of class ids in one channel, beside Roboflow's `_classes.csv` ("Pixel Value, Class"), or a
+      `classes.txt` whose line numbers are the ids, from 0 if the first is "background", else from 1.
+
+    In COCO and YOLO an image without a shape is not labelled; later shapes cover earlier ones. Nothing outside the
+    folder is opened.
+
+    Raises `InputError` for anything else.
+    """
+    if os.path.isfile(path):
+        return _read_coco(path.parent, path, read_json(path))
+    if not path.is_dir():
+        raise CaptureError(path, "there are no labels here", "give the file or the folder that the tool exported")
+    files = sorted(f for f in path.rglob("*") if os.path.isfile(f) and is_inside(path, f))
+    jsons = [(f, read_json(f)) for f in files if f.suffix == ".json"]
+    if coco := [(f, content) for f, content in jsons if "annotations" in content and "images" in content]:
+        return _merged([_read_coco(path, f, content) for f, content in coco])
+    if texts := _yolo_texts(files):
+        return _read_yolo(path, files, texts)
+    if pngs := [f for f in files if f.suffix.lower() == ".png"]:
+        return _read_masks(path, files, pngs)
+    raise CaptureError(
+        path,
+        "there are no labels here",
+        "export them as COCO segmentation, as YOLO polygons with data.yaml, or as mask PNGs with _classes.csv",
+    )
+
+
+def _merged(exports: Sequence[Annotations]) -> Annotations:
+    """Files of one project (train, valid, test, or one a state), whose lists of classes must be the same."""
+    for export in exports[1:]:
+        if export.classes != exports[0].classes:
+            first, other = exports[0].images[0].file, export.images[0].file
+            raise CaptureError(other, f"its classes differ from those of {first}", "import one export at a time")
+    return replace(exports[0], images=tuple(image for export in exports for image in export.images))
+
+
+# ---------------------------------------------------------------------------------------------- COCO
+
+
+def _read_coco(root: Path, file: Path, content: dict[str, Any]) -> Annotations:
+    def objects(key: str) -> Iterator[dict[str, Any]]:
+        values = content.get(key)
+        if not isinstance(values, list):
+            raise CaptureError(file, f"{key} is {show(values)}", "export the labels as COCO segmentation")
+        for i, value in enumerate(values):
+            if not isinstance(value, dict):
+                raise CaptureError(file, f"{key}[{i}] is {show(value)}", "write it as an object")
+            yield value
+
+    def field(value: dict[str, Any], key: str, kind: type, of: str) -> Any:
+        found = value.get(key)
+        if not isinstance(found, kind) or isinstance(found, bool):
+            raise CaptureError(file, f"{key} of {of} is {show(found)}", "export the labels again")
+        return found
+
+    categories = sorted(objects("categories"), key=lambda c: field(c, "id", int, "a category"))
+    drawn: dict[int, list[tuple[int, Any]]] = {}
+    used = set()
+    for annotation in objects("annotations"):
+        used.add(category := field(annotation, "category_id", int, "an annotation"))
+        image = field(annotation, "image_id", int, "an annotation")
+        drawn.setdefault(image, []).append((category, annotation.get("segmentation")))
+    named = {c["id"]: field(c, "name", str, f"category {c['id']}") for c in categories}
+    # Roboflow puts the project's name before the classes, as the category that they belong to.
+    above = [c.get("supercategory") for c in categories if c.get("supercategory") != c["name"]]
+    named = {i: name for i, name in named.items() if i in used or name not in above}
+    place = {i: k for k, i in enumerate(named, start=1)}
+    if unknown := used - set(place):
+        raise CaptureError(file, f"category_id {min(unknown)} is in no category", "export the labels again")
+    _check_classes(file, list(named.values()))
+
+    images = []
+    for image in objects("images"):
+        number = field(image, "id", int, "an image")
+        name = field(image, "file_name", str, f"image {number}")
+        width, height = (field(image, key, int, f"image {name!r}") for key in ("width", "height"))
+        shapes = [(place[category], shape) for category, shape in drawn.pop(number, [])]
+        if shapes:
+            path = (file.parent.relative_to(root) / name).as_posix()
+            images.append(AnnotatedImage(file, path, (width, height), _CocoShapes(file, path, shapes)))
+    if drawn:
+        raise CaptureError(file, f"image_id {min(drawn)} of an annotation is no image's", "export the labels again")
+    if not images:
+        raise CaptureError(file, "it labels no image", "export labelled images")
+    return Annotations("COCO", tuple(named.values()), tuple(images))
+
+
+@dataclass(frozen=True)
+class _CocoShapes:
+    file: Path
+    name: str
+    shapes: Sequence[tuple[int, Any]]
+
+    def __call__(self, width: int, height: int) -> np.ndarray:
+        labels = np.zeros((height, width), np.uint16)
+        for value, shape in self.shapes:
+            what = f"a segmentation of {self.name!r}"
+            if isinstance(shape, list) and shape:
+                for polygon in shape:
+                    fill_polygon(labels, _corners(self.file, what, polygon), value)
+            elif isinstance(shape, dict) and shape.get("size") == [height, width]:
+                labels[self._mask(what, shape.get("counts"), width, height)] = value
+            else:
+                mend = "export polygons or masks of the image's size, not boxes"
+                raise CaptureError(self.file, f"{what} is {show(shape)}", mend)
+        return labels
+
+    def _mask(self, what: str, counts: Any, width: int, height: int) -> np.ndarray:
+        try:
+            if isinstance(counts, str):
+                return decode_runs(decompress_runs(counts), width, height)
+            if isinstance(counts, list) and all(type(count) is int for count in counts):
+                return decode_runs(counts, width, height)
+        except ValueError as error:
+            raise CaptureError(self.file, f"in {what}, {error}", "export the labels again") from None
+        raise CaptureError(self.file, f"counts of {what} is {show(counts)}", "export the labels again")
+
+
+def _corners(file: Path, what: str, values: Any) -> np.ndarray:
+    """A polygon [N, 2] from x, y, x, y, ..."""
+    if not isinstance(values, list) or len(values) < 6 or len(values) % 2:
+        mend = "give the x and y of three corners or more; a box is no polygon"
+        raise CaptureError(file, f"{what} is {show(values)}", mend)
+    return np.array([parse_number(file, f"a coordinate of {what}", value) for value in values]).reshape(-1, 2)
+
+
+# ---------------------------------------------------------------------------------------------- YOLO
+
+
+def _yolo_texts(files: Sequence[Path]) -> list[Path]:
+    texts = [f for f in files if f.suffix == ".txt" and f.name not in _CLASS_LISTS]
+    return [f for f in texts if "labels" in f.parts] or [f for f in texts if not f.name.upper().startswith("README")]
+
+
+def _read_yolo(path: Path, files: Sequence[Path], texts: Sequence[Path]) -> Annotations:
+    classes = _check_classes(path, _yolo_classes(path, files))
+    pictures = {f.with_suffix(""): f for f in files if f.suffix.lower() in IMAGE_SUFFIXES}
+    images = []
+    for file in texts:
+        shapes = list(_yolo_shapes(file, len(classes)))
+        if shapes:
+            # .../labels/train/x.txt belongs to .../images/train/x.jpg.
+            beside = Path(*["images" if part == "labels" else part for part in file.with_suffix("").parts])
+            picture = pictures.get(beside) or pictures.get(file.with_suffix(""))
+            name = file.relative_to(path).with_suffix("").as_posix()
+            images.append(AnnotatedImage(file, name, picture and image_size(picture), _YoloShapes(shapes)))
+    if not images:
+        raise CaptureError(path, "it labels no image", "export labelled images")
+    return Annotations("YOLO", tuple(classes), tuple(images))
+
+
+def _yolo_classes(path: Path, files: Sequence[Path]) -> list[str]:
+    found = []
+    for file in (f for f in files if f.name in ("data.yaml", "data.yml", "dataset.yaml")):
+        try:
+            content = yaml.safe_load(read_text(file))
+        except (yaml.YAMLError, RecursionError, ValueError):
+            raise CaptureError(file, "the file is not YAML", "export the labels again") from None
+        names = content.get("names") if isinstance(content, dict) else None
+        if isinstance(names, dict) and list(names) == list(range(len(names))):
+            names = list(names.values())
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise CaptureError(file, f"names is {show(names)}", "list the classes' names")
+        found.append((file, names))
+    return _the_one(found) if found else _listed_classes(path, files, "data.yaml or classes.txt")
+
+
+def _listed_classes(path: Path, files: Sequence[Path], wanted: str) -> list[str]:
+    lists = [f for f in files if f.name in _CLASS_LISTS]
+    if not lists:
+        raise CaptureError(path, "the names of the classes are missing", f"put the export's {wanted} beside the labels")
+    return _the_one([(f, [line.strip() for line in read_text(f).splitlines() if line.strip()]) for f in lists])
+
+
+def _the_one(found: Sequence[tuple[Path, Any]]) -> Any:
+    """What all files say of the classes."""
+    for file, classes in found[1:]:
+        if classes != found[0][1]:
+            raise CaptureError(file, f"its classes differ from those of {found[0][0]}", "import one export at a time")
+    return found[0][1]
+
+
+def _yolo_shapes(file: Path, num_classes: int) -> Iterator[tuple[int, np.ndarray]]:
+    for i, line in enumerate(read_text(file).splitlines(), start=1):
+        if not (words := line.split()):
+            continue
+        try:
+            numbers = [float(word) for word in words[1:]]
+            number = int(words[0])
+        except ValueError:
+            raise CaptureError(file, f"line {i} is {show(line)}", "write a class number and coordinates") from None
+        if not 0 <= number < num_classes:
+            raise CaptureError(file, f"line {i} has class {number} of {num_classes}", "add its name to the classes")
+        corners = _corners(file, f"line {i}", numbers)
+        if corners.min() < -0.01 or corners.max() > 1.01:
+            raise CaptureError(file, f"line {i} has coordinates beyond 0 to 1", "divide them by width and height")
+        yield number + 1, corners
+
+
+@dataclass(frozen=True)
+class _YoloShapes:
+    shapes: Sequence[tuple[int, np.ndarray]]
+
+    def __call__(self, width: int, height: int) -> np.ndarray:
+        labels = np.zeros((height, width), np.uint16)
+        for value, corners in self.shapes:
+            fill_polygon(labels, corners * [width, height], value)
+        return labels
+
+
+# ---------------------------------------------------------------------------------------------- mask PNGs
+
+
+def _read_masks(path: Path, files: Sequence[Path], pngs: Sequence[Path]) -> Annotations:
+    named = _mask_classes(path, files)
+    marked = [f for f in pngs if f.stem.endswith("_mask")]  # Roboflow's, which lie beside the images
+    place = np.zeros(256, np.uint16)
+    for k, value in enumerate(named, start=1):
+        place[value] = k
+    images = []
+    for file in marked or pngs:
+        name = file.relative_to(path).as_posix()
+        if marked:
+            name = re.sub(r"_mask\.png$", ".png", name, flags=re.IGNORECASE)
+        images.append(AnnotatedImage(file, name, image_size(file), _Mask(file, place, tuple(named))))
+    return Annotations("masks", tuple(named.values()), tuple(images))
+
+
+def _mask_classes(path: Path, files: Sequence[Path]) -> dict[int, str]:
+    """The names of the pixel values; 0 and 255, where they have none, are the background and what is unlabelled."""
+    found = [(file, _csv_classes(file)) for file in files if file.name == "_classes.csv"]
+    if found:
+        named = _the_one(found)
+    else:
+        names = _listed_classes(path, files, "_classes.csv or classes.txt")
+        named = dict(enumerate(names, start=0 if names[:1] and names[0].lower() in BACKGROUND_NAMES else 1))
+    _check_classes(path, list(named.values()))
+    return {0: BACKGROUND_NAMES[0], UNLABELLED: UNLABELLED_NAMES[0], **named}
+
+
+def _csv_classes(file: Path) -> dict[int, str]:
+    named = {}
+    for i, line in enumerate(read_text(file).splitlines()[1:], start=2):
+        if line.strip():
+            value, _, name = (word.strip() for word in line.partition(","))
+            if not re.fullmatch("[0-9]{1,3}", value) or int(value) > UNLABELLED or not name:
+                raise CaptureError(file, f"line {i} is {show(line)}", "write a pixel value and a class name")
+            named[int(value)] = name
+    return named
+
+
+@dataclass(frozen=True)
+class _Mask:
+    file: Path
+    place: np.ndarray
+    values: tuple[int, ...]
+
+    def __call__(self, width: int, height: int) -> np.ndarray:
+        labels = read_labels(self.file)
+        if unknown := set(np.unique(labels).tolist()) - set(self.values):
+            raise CaptureError(self.file, f"no class has the value {min(unknown)}", "add it to the list of classes")
+        return self.place[labels]
+
+
+def _check_classes(file: Path, names: list[str]) -> list[str]:
+    if not names or len(names) > MAX_LABEL or len({n.lower() for n in names}) < len(names) or not all(names):
+        found = f"the classes are {show(names)}"
+        raise CaptureError(file, found, f"give 1 to {MAX_LABEL} names, each another")
+    return names

@@ -1,0 +1,349 @@
+"""A capture looked at as a whole: do silhouettes, labels and states fit each other; which frame to label next."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatart_ns.capture.capture import Capture, Frame, Normalization, Problem, State
+from splatart_ns.capture.check import check_structure
+from splatart_ns.capture.hull import carve, fitting_views, silhouette, visible
+from splatart_ns.capture.part_votes import Ballot, PartVotes, read_ballots, vote
+from splatart_ns.capture.view import View, load_view
+from splatart_ns.errors import InputError
+
+_PIXELS = 256
+"""Frames are looked at with at most so many pixels along a side."""
+_MOST_FRAMES = 300
+"""Of each state; the labelled first, evenly spread."""
+_FEW_FRAMES = 3
+_WRONG_PART = 0.6
+"""A frame's labels are wrong where it contradicts the others on so much of a part, and on so many points of it:"""
+_ENOUGH_POINTS = 30
+_MOST_WRONG = 30
+"""So many wrong frames are named of each state."""
+_WIDE_BAND, _SHIFTED_BAND = 0.02, 0.02
+"""How far a labels' outline may lie from the silhouette's, as a share of the object's size: all frames, one frame."""
+_STAYS, _MOVES = 0.93, 0.6
+"""A part rests from one state to another if so much of it is at the same place, and moves if less than the second; in
+between, another part may have moved before it."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What the labelled training frames of a state show of a part."""
+
+    state: str
+    part: str
+    frames: int
+    """How many of them show it."""
+    labelled: int
+    """How many there are."""
+
+
+@dataclass(frozen=True)
+class Examination:
+    """What `examine` found."""
+
+    capture: Capture | None
+    problems: tuple[Problem, ...]
+    """Errors first."""
+    coverage: tuple[Coverage, ...] = ()
+    suggested: tuple[Frame, ...] = ()
+    """The frames to label next, the most useful first."""
+
+    @property
+    def errors(self) -> int:
+        return sum(problem.severity == "error" for problem in self.problems)
+
+
+def as_text(examination: Examination) -> str:
+    """Lines of problems, a table of what labelled frames show of the parts, the frames to label next, a sum."""
+    lines = [f"{problem.severity}: {problem}" for problem in examination.problems]
+    rows: dict[str, list[str]] = {}
+    for item in examination.coverage:
+        rows.setdefault(item.part, []).append(f"{item.frames} of {item.labelled}")
+    states = list(dict.fromkeys(item.state for item in examination.coverage))
+    if rows:
+        width = max(len("seen in labelled frames"), *map(len, rows))
+        lines.append("  ".join(["seen in labelled frames".ljust(width), *(state.rjust(10) for state in states)]))
+        for part, cells in rows.items():
+            aligned = (c.rjust(max(10, len(state))) for c, state in zip(cells, states, strict=True))
+            lines.append("  ".join([part.ljust(width), *aligned]))
+    lines += [f"label next: {frame.image}" for frame in examination.suggested]
+    lines.append(f"{examination.errors} errors, {len(examination.problems) - examination.errors} warnings")
+    return "\n".join(lines)
+
+
+def as_json(examination: Examination) -> str:
+    """The same as JSON, for scripts."""
+    value = {
+        "errors": examination.errors,
+        "problems": [{**asdict(problem), "file": str(problem.file)} for problem in examination.problems],
+        "coverage": [asdict(item) for item in examination.coverage],
+        "label_next": [str(frame.image) for frame in examination.suggested],
+    }
+    return json.dumps(value, indent=1)
+
+
+@dataclass
+class _Evidence:
+    """A state's frames, and the surface that its silhouettes leave."""
+
+    state: State
+    normalization: Normalization
+    frames: list[Frame]
+    views: list[View]
+    points: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
+    """Voxels of the surface [N, 3] in the state's normalised world; none where there is no hull."""
+    size: float = 0.0
+    votes: PartVotes | None = None
+
+    @property
+    def labelled(self) -> list[View]:
+        return [view for view in self.views if view.labels is not None]
+
+    def points_in(self, other: _Evidence) -> tuple[Tensor, float]:
+        """The surface in another state's normalised world, and the voxels' size there."""
+        world = self.points.double() / self.normalization.scale + torch.from_numpy(self.normalization.centre)
+        there = (world - torch.from_numpy(other.normalization.centre)) * other.normalization.scale
+        return there.float(), self.size * other.normalization.scale / self.normalization.scale
+
+
+def examine(path: Path | str, suggest: int = 0) -> Examination:
+    """All that `check_capture` finds, and what only frames together show.
+
+    - Silhouettes: whether any point projects inside all of them, and which do not fit the others' visual hull.
+    - Labels: frames that contradict the other frames on a part, by votes on the hull's surface; outlines of labels
+      against silhouettes; parts that few labelled frames show.
+    - States: whether a part moved, and whether one stayed, between the first state and the others.
+
+    `suggest` frames to label next are chosen one after the other: the training frame that adds most to
+    sum_v w_v (1 - 2^-n_v), where n_v labelled frames see the point v of the surface and w_v = 1 / (points of its part),
+    so that parts and states count alike. (The greedy choice for a submodular sum reaches 1 - 1/e of the best one's;
+    Nemhauser, Wolsey and Fisher 1978.)
+
+    Never raises for what is in the capture.
+    """
+    capture, problems = check_structure(Path(path))
+    if capture is None:
+        return Examination(None, tuple(problems))
+    evidence = [_read_evidence(state) for state in capture.states]
+    num_parts = max(capture.parts, default=0)
+    for one in evidence:
+        problems.extend(_carve(capture, one))
+        problems.extend(_check_outlines(capture, one))
+        if len(one.points) and one.labelled:
+            one.votes = vote(one.labelled, one.points, one.size, num_parts)
+            problems.extend(_check_votes(capture, one))
+        problems.extend(_check_coverage(capture, one))
+    for other in evidence[1:]:
+        problems.extend(_check_motion(capture, evidence[0], other))
+    return Examination(
+        capture=capture,
+        problems=tuple(sorted(dict.fromkeys(problems), key=lambda p: p.severity != "error")),
+        coverage=tuple(_coverage(one, i, name) for i, name in capture.parts.items() for one in evidence),
+        suggested=tuple(_suggest(evidence, num_parts, suggest)),
+    )
+
+
+def _read_evidence(state: State) -> _Evidence:
+    frames = sorted(state.frames, key=lambda frame: frame.labels is None)
+    if len(frames) > _MOST_FRAMES:
+        labelled = sum(frame.labels is not None for frame in frames)
+        head, rest = frames[:labelled], frames[labelled:]
+        frames = _spread(head, _MOST_FRAMES) + _spread(rest, max(0, _MOST_FRAMES - labelled))
+    T = np.stack([frame.T_world_camera for frame in frames])
+    half = [math.atan(min(c.width / c.fx, c.height / c.fy) / 2) for c in (frame.camera for frame in frames)]
+    normalization = Normalization.from_cameras(T, np.array(half))
+
+    def read(frame: Frame) -> View | None:
+        try:
+            longest = max(frame.camera.width, frame.camera.height)
+            return load_view(frame, normalization, -(-longest // _PIXELS))
+        except InputError:  # `check_structure` has told
+            return None
+
+    with ThreadPoolExecutor() as pool:
+        views = list(pool.map(read, frames))
+    kept = [(frame, view) for frame, view in zip(frames, views, strict=True) if view is not None]
+    return _Evidence(state, normalization, [frame for frame, _ in kept], [view for _, view in kept])
+
+
+def _spread(frames: list[Frame], count: int) -> list[Frame]:
+    """At most so many of the frames, evenly."""
+    return frames if len(frames) <= count else [frames[i] for i in np.linspace(0, len(frames) - 1, count).astype(int)]
+
+
+# ---------------------------------------------------------------------------------------------- silhouettes
+
+
+def _carve(capture: Capture, one: _Evidence) -> Iterator[Problem]:
+    """Problems with the silhouettes. Where they fit each other, the evidence gets its surface, and loses the frames
+    that do not fit."""
+    masks = [silhouette(view) for view in one.views]
+    known = [i for i, mask in enumerate(masks) if mask is not None and mask.any() and not mask.all()]
+    if len(known) < 3:
+        return
+    carving = carve([one.views[i] for i in known])
+    place = capture.path / one.state.name
+    mend = "check that poses are camera-to-world in OpenGL axes, the intrinsics, and that masks are white inside"
+    agreement = float((carving.accepted.sum(0) * carving.seen).max()) / len(known)
+    if agreement < 0.75:
+        found = f"the silhouettes contradict each other: no point lies inside more than {agreement:.0%} of them"
+        yield Problem("error", place, found, mend)
+        return
+    fitting = fitting_views(carving)
+    if fitting is None:
+        outside = float(carving.uncovered(torch.ones(len(known), dtype=torch.bool)).median())
+        found = f"the silhouettes do not fit: {outside:.0%} of a frame's lies inside no point that all frames accept"
+        yield Problem("error" if outside > 0.5 else "warning", place, found, mend)
+        return
+    odd = [known[i] for i in torch.nonzero(~fitting).flatten().tolist()]
+    for frame in (one.frames[i] for i in odd):
+        found = f"the silhouette of {frame.name} does not fit those of the other frames"
+        mend = "correct its pose or its mask, or take the frame out"
+        yield Problem("warning", frame.object_mask or frame.image, found, mend)
+    one.points, one.size = carving.surface(fitting), carving.size
+    one.frames = [frame for i, frame in enumerate(one.frames) if i not in odd]
+    one.views = [view for i, view in enumerate(one.views) if i not in odd]
+
+
+def _check_outlines(capture: Capture, one: _Evidence) -> Iterator[Problem]:
+    """Labels whose outline is not the silhouette's."""
+    bands: list[tuple[Frame, float]] = []
+    for frame, view in zip(one.frames, one.views, strict=True):
+        if view.labels is None or view.alpha is None:
+            continue
+        inside = view.alpha > 127
+        known = view.labels != 255
+        edge = float((inside[1:] != inside[:-1]).sum() + (inside[:, 1:] != inside[:, :-1]).sum())
+        if edge and inside.any():
+            differ = float((((view.labels > 0) != inside) & known).sum())
+            bands.append((frame, differ / edge / math.sqrt(float(inside.sum()))))
+    usual = float(np.median([band for _, band in bands])) if bands else 0.0
+    if usual > _WIDE_BAND:
+        found = f"the outlines of labels and silhouettes lie {usual:.1%} of the object's size apart"
+        mend = "label up to the object's edge, or correct the masks"
+        yield Problem("warning", capture.path / one.state.name, found, mend)
+    for frame, band in bands:
+        if band > max(_SHIFTED_BAND, 4 * usual):
+            found = f"the labels of {frame.name} do not fit its silhouette"
+            yield Problem("warning", frame.labels, found, "label it again, or take its semantics_path out")
+
+
+# ---------------------------------------------------------------------------------------------- labels
+
+
+def _check_votes(capture: Capture, one: _Evidence) -> Iterator[Problem]:
+    """Labels that contradict the other frames', the worst first; what is wrong has no vote on the next."""
+    frames = {id(b): f for f, b in zip((f for f in one.frames if f.labels is not None), one.votes.ballots, strict=True)}
+
+    def worst_part(ballot: Ballot) -> tuple[float, str]:
+        share, number = one.votes.disagreement(ballot)
+        known = [(float(share[i]), name) for i, name in capture.parts.items() if number[i] >= _ENOUGH_POINTS]
+        return max(known, default=(0.0, ""))
+
+    for _ in range(min(_MOST_WRONG, len(one.votes.ballots))):
+        (share, name), ballot = max(((worst_part(b), b) for b in one.votes.ballots), key=lambda pair: pair[0])
+        if share <= _WRONG_PART:
+            return
+        frame = frames[id(ballot)]
+        one.votes = one.votes.without(ballot)
+        found = f"the labels of {frame.name} contradict the other frames on {share:.0%} of the part {name}"
+        yield Problem("warning", frame.labels, found, "label it again, or take its semantics_path out")
+
+
+def _shows(view: View, part: int) -> bool:
+    return bool((view.labels == part).any())
+
+
+def _coverage(one: _Evidence, part: int, name: str) -> Coverage:
+    labelled = _labelled_for_training(one)
+    return Coverage(one.state.name, name, sum(_shows(view, part) for view in labelled), len(labelled))
+
+
+def _labelled_for_training(one: _Evidence) -> list[View]:
+    pairs = zip(one.frames, one.views, strict=True)
+    return [view for frame, view in pairs if view.labels is not None and frame.split == "train"]
+
+
+def _check_coverage(capture: Capture, one: _Evidence) -> Iterator[Problem]:
+    labelled = _labelled_for_training(one)
+    for i, name in capture.parts.items():
+        count = sum(_shows(view, i) for view in labelled)
+        if 0 < count < _FEW_FRAMES:
+            found = f"part {i} ({name}) is seen in {count} labelled training frame" + "s" * (count > 1)
+            mend = "label more frames that show it; `splatart check --suggest 3` names some"
+            yield Problem("warning", capture.path / one.state.name, found, mend)
+
+
+# ---------------------------------------------------------------------------------------------- states
+
+
+def _in_place(a: _Evidence, b: _Evidence, num_parts: int) -> Tensor:
+    """How much of each part [P + 1] of state a is at the same place in the labels of b, as a share of what is so in
+    those of a; NaN where few points are seen."""
+    part = a.votes.parts()
+    there = read_ballots(b.labelled, *a.points_in(b), num_parts)
+    right, number = torch.zeros(2, num_parts + 1), torch.zeros(2, num_parts + 1)
+    for k, ballots in enumerate((a.votes.ballots, there)):
+        for ballot in ballots:
+            own = part[ballot.points]
+            agrees = ballot.near[own, torch.arange(len(own))]
+            right[k] += torch.bincount(own, agrees.float(), num_parts + 1)
+            number[k] += torch.bincount(own, minlength=num_parts + 1)
+    share = right / number
+    return torch.where((number >= _ENOUGH_POINTS).all(0), share[1] / share[0], math.nan)
+
+
+def _check_motion(capture: Capture, first: _Evidence, other: _Evidence) -> Iterator[Problem]:
+    if first.votes is None or other.votes is None:
+        return
+    parts = list(capture.parts)
+    both = torch.stack([_in_place(first, other, max(parts)), _in_place(other, first, max(parts))])[:, parts]
+    share = both.amin(0)  # a part that comes out of another is seen where it was, but was not where it is seen
+    known = share[share.isfinite()]
+    place = capture.path / other.state.name
+    if len(known) == len(parts) > 1 and bool((known > _STAYS).all()):
+        found = f"no part seems to have moved since {first.state.name}"
+        yield Problem(
+            "warning", place, found, "show another configuration, or check the poses; a round part may have turned"
+        )
+    if len(known) and bool((known < _MOVES).all()):
+        found = f"no part is where it was in {first.state.name}: the states may have different worlds or labels"
+        mend = "give all poses in one world, for instance by one run of COLMAP over all images, and all parts one id"
+        yield Problem("warning", place, found, mend)
+
+
+# ---------------------------------------------------------------------------------------------- what to label next
+
+
+def _suggest(evidence: Sequence[_Evidence], num_parts: int, count: int) -> Iterator[Frame]:
+    candidates: list[tuple[Frame, int, Tensor]] = []
+    gains = []
+    for k, one in enumerate(evidence):
+        part = torch.zeros(len(one.points), dtype=torch.long) if one.votes is None else one.votes.parts()
+        weight = 1.0 / torch.bincount(part, minlength=num_parts + 1).clamp_min(1)[part]
+        times = torch.zeros(len(one.points))
+        for frame, view in zip(one.frames, one.views, strict=True):
+            seen = visible(view, one.points, one.size)
+            if view.labels is not None:
+                times += seen
+            elif frame.split == "train":
+                candidates.append((frame, k, seen))
+        gains.append(weight * 0.5 ** (times + 1))
+    while count > 0 and candidates:
+        best = max(range(len(candidates)), key=lambda i: float(gains[candidates[i][1]][candidates[i][2]].sum()))
+        frame, k, seen = candidates.pop(best)
+        gains[k] = torch.where(seen, gains[k] / 2, gains[k])
+        count -= 1
+        yield frame

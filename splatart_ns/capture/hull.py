@@ -1,0 +1,177 @@
+"""The visual hull of one state's silhouettes, the silhouettes that do not fit the others, what each view sees of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from splatart_ns.capture.capture import UNLABELLED
+from splatart_ns.capture.view import View
+from splatart_ns.geometry.camera import project_points
+
+UNCOVERED = 0.03
+"""Silhouettes fit each other where no more of each than this share lies outside the hull's projection."""
+_COARSE, _FINE = 40, 64
+_MOST_ODD = 0.25
+_SUSPECTS = 3
+
+
+def silhouette(view: View) -> Tensor | None:
+    """What a view says of the object's outline, bool [H, W]: its alpha, else its labels, else nothing."""
+    if view.alpha is not None:
+        return view.alpha > 127
+    if view.labels is not None and not bool((view.labels == UNLABELLED).any()):
+        return view.labels > 0
+    return None
+
+
+@dataclass
+class Carving:
+    """A grid of voxels, and which of them the views let be inside the object."""
+
+    views: Sequence[View]
+    """Those with a silhouette."""
+    points: Tensor
+    """Centres of the voxels [X, Y, Z, 3] in the views' world."""
+    size: float
+    """Side of a voxel."""
+    accepted: Tensor
+    """Whether view v lets a voxel be inside, bool [V, X, Y, Z]. A point beyond an image's border is not, unless the
+    silhouette is cut off there."""
+    seen: Tensor
+    """Whether a voxel falls into an image at all, bool [X, Y, Z]."""
+
+    def inside(self, views: Tensor) -> Tensor:
+        """The voxels that all chosen `views` (bool [V]) let be inside: [X, Y, Z] bool."""
+        return self.accepted[views].all(0) & self.seen
+
+    def surface(self, views: Tensor) -> Tensor:
+        """The centres [N, 3] of the outermost of these voxels."""
+        full = self.inside(views)
+        padded = F.pad(full, (1,) * 6)
+        inner = full.clone()
+        for axis in range(3):
+            for step in (-1, 1):
+                inner &= padded.roll(step, axis)[1:-1, 1:-1, 1:-1]
+        return self.points[full & ~inner]
+
+    def missing(self, view: View, hull: Tensor) -> Tensor:
+        """The pixels [H, W] of a view's silhouette that none of the voxels `hull` [N, 3] projects to."""
+        mask = silhouette(view)
+        column, row, _, visible = project(view, hull)
+        hit = torch.zeros_like(mask)
+        hit[row[visible], column[visible]] = True
+        return mask & ~widened(hit, footprint(view, self.size))
+
+    def uncovered(self, views: Tensor) -> Tensor:
+        """The share of each view's silhouette [V] that the hull of `views` (bool [V]) misses; 0 for the other views."""
+        shares, hull = torch.zeros(len(self.views)), self.points[self.inside(views)]
+        for i in torch.nonzero(views).flatten().tolist():
+            view = self.views[i]
+            shares[i] = self.missing(view, hull).sum() / silhouette(view).sum()
+        return shares
+
+
+def carve(views: Sequence[View]) -> Carving:
+    """Carve a box around all that 3 of 4 views agree on. Every view needs a silhouette that is not empty."""
+    low, high = torch.full((3,), -1.5), torch.full((3,), 1.5)
+    for count in (_COARSE, _FINE):
+        size = float((high - low).max()) / count
+        axes = [torch.arange(float(a) + size / 2, float(b), size) for a, b in zip(low, high, strict=True)]
+        points = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+        accepted = torch.zeros(len(views), *points.shape[:3], dtype=torch.bool)
+        seen = torch.zeros(points.shape[:3], dtype=torch.bool)
+        for i, view in enumerate(views):
+            mask = silhouette(view)
+            border = torch.cat([*mask[[0, -1]], *mask[:, [0, -1]].T])
+            column, row, _, visible = project(view, points.reshape(-1, 3))
+            mask = widened(mask, footprint(view, size))
+            accepted[i] = torch.where(visible, mask[row, column], border.any()).reshape(seen.shape)
+            seen |= visible.reshape(seen.shape)
+        full = (accepted.sum(0) >= (1 - _MOST_ODD) * len(views)) & seen
+        if not full.any():
+            break
+        low, high = points[full].amin(0) - 2 * size, points[full].amax(0) + 2 * size
+    return Carving(views, points, size, accepted, seen)
+
+
+def fitting_views(carving: Carving) -> Tensor | None:
+    """The views whose silhouettes fit each other, bool [V]; None if more than a tenth of them, and three, do not.
+
+    As long as the hull does not cover all silhouettes, the view goes without which they are covered best. Tried are
+    those that are covered worst themselves, and those that alone, or nearly so, reject voxels that others miss. Then
+    those come back that do no harm.
+    """
+
+    def deficit(views: Tensor) -> float:
+        return float((carving.uncovered(views) - UNCOVERED).clamp_min(0).sum())
+
+    def without(views: Tensor, i: int) -> Tensor:
+        return views & (torch.arange(len(views)) != i)
+
+    views = torch.ones(len(carving.views), dtype=torch.bool)
+    removed: list[int] = []
+    while deficit(views) > 0:
+        if len(removed) >= max(3, len(views) // 10):
+            return None
+        suspects = {*carving.uncovered(views).topk(_SUSPECTS).indices.tolist()}
+        suspects |= {*_blame(carving, views).topk(_SUSPECTS).indices.tolist()}
+        removed.append(min(suspects, key=lambda i: deficit(without(views, i))))
+        views = without(views, removed[-1])
+    for i in removed[:-1]:
+        views[i] = True
+        views[i] = deficit(views) == 0
+    return views
+
+
+def _blame(carving: Carving, views: Tensor) -> Tensor:
+    """How much each view [V] takes from the hull that other silhouettes miss. A voxel's blame goes to those that reject
+    it, and falls with the square of their number: where all but one agree, that one is wrong."""
+    rejected = ~carving.accepted[views]
+    times = rejected.sum(0)
+    near = (times > 0) & (times <= max(1, _MOST_ODD * len(rejected))) & carving.seen
+    wanted, hull = torch.zeros(int(near.sum())), carving.points[carving.inside(views)]
+    for i in torch.nonzero(views).flatten().tolist():
+        column, row, _, visible = project(carving.views[i], carving.points[near])
+        wanted += visible & carving.missing(carving.views[i], hull)[row, column]
+    blame = torch.zeros(len(views))
+    blame[views] = (rejected[:, near] * (wanted / times[near] ** 2)).sum(1)
+    return blame
+
+
+def project(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Pixel column and row [N] (clamped into the image), depth [N], and whether the point falls into the image."""
+    pixels, depth = project_points(points, view.viewmat, view.K)
+    u, v = pixels.floor().unbind(-1)
+    inside = (depth > 0) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
+    return u.clamp(0, view.width - 1).long(), v.clamp(0, view.height - 1).long(), depth, inside
+
+
+def visible(view: View, points: Tensor, size: float) -> Tensor:
+    """Which voxels [N, 3] of a hull's surface a view sees, none before them: [N] bool; some by edges it does not."""
+    column, row, depth, inside = project(view, points)
+    if not inside.any():
+        return inside
+    # A depth buffer of cells as wide as a voxel; its minimum over the neighbours closes the gaps between points.
+    cell = max(1, round(1.2 * size * float(view.K[0, 0] / depth[inside].median())))
+    width, height = view.width // cell + 1, view.height // cell + 1
+    where = row // cell * width + column // cell
+    nearest = torch.full((height * width,), torch.inf)
+    nearest.scatter_reduce_(0, where[inside], depth[inside], "amin")
+    nearest = -F.max_pool2d(-nearest.reshape(1, 1, height, width), 3, stride=1, padding=1).flatten()
+    return inside & (depth < nearest[where] + 2.5 * size)
+
+
+def footprint(view: View, size: float) -> int:
+    """Half a voxel's diagonal in pixels, so that no thin part falls between the voxels' centres."""
+    return round(0.87 * size * float(view.K[0, 0] / view.viewmat[:3, 3].norm().clamp_min(0.1)))
+
+
+def widened(mask: Tensor, reach: int) -> Tensor:
+    """A mask [H, W] with all pixels that are at most `reach` pixels aside and up or down."""
+    pooled = F.max_pool2d(mask[None, None].float(), 2 * reach + 1, stride=1, padding=reach)
+    return pooled[0, 0] > 0

@@ -1,0 +1,271 @@
+"""Captures made of what other tools leave: labels of annotation tools, and state folders of ns-process-data."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from splatart_ns.capture.annotations import (
+    BACKGROUND_NAMES,
+    IMAGE_SUFFIXES,
+    UNLABELLED_NAMES,
+    AnnotatedImage,
+    Annotations,
+    read_annotations,
+)
+from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame, State
+from splatart_ns.capture.formats import TRANSFORMS, load_capture, load_states
+from splatart_ns.capture.images import MAX_LABEL, write_png
+from splatart_ns.capture.values import is_inside, read_json, relative_path
+from splatart_ns.errors import InputError
+from splatart_ns.files import new_folder, write_json
+
+
+@dataclass(frozen=True)
+class LabelImport:
+    """What an import of labels did."""
+
+    format: str
+    """"COCO", "YOLO" or "masks"."""
+    labelled: int
+    """Frames that got labels."""
+    frames: int
+    parts: tuple[str, ...]
+    """Names of the parts 1, 2, ..."""
+    unmatched: tuple[str, ...]
+    """Labelled images that no frame belongs to."""
+
+
+def import_capture(sources: Sequence[Path], output_dir: Path, labels: Path | None = None) -> LabelImport | None:
+    """Copy a capture, or the folders of its states in their order, and give the copy an annotation tool's labels.
+
+    Args:
+        sources: one capture, or two or more folders with a transforms.json each, as ns-process-data leaves them.
+        output_dir: a folder that does not exist yet, or is empty.
+        labels: as `import_labels` takes them.
+
+    Links to folders, and links that leave a source, are not copied.
+
+    Raises:
+        InputError: anything that cannot be read or written; labels that fit no frame, or not the frames' sizes.
+    """
+    if len(sources) == 1:
+        load_capture(sources[0])
+    else:
+        load_states(sources)
+    with new_folder(output_dir) as folder:
+        targets = [folder] if len(sources) == 1 else [folder / f"state_{k:02d}" for k in range(len(sources))]
+        for source, target in zip(sources, targets, strict=True):
+            _copy(source, target, output_dir)
+        return None if labels is None else import_labels(folder, labels)
+
+
+def import_labels(path: Path, labels: Path) -> LabelImport:
+    """Write the labels of an export (see `read_annotations`) into a capture: PNGs of part ids, `semantics_path` of the
+    frames, `semantic_classes`. PARIS folders get a transforms.json, which has a place for them.
+
+    An image of the export belongs to the frame of the same stem, or of the same path joined in any way (Roboflow's
+    `state_00_0001_jpg.rf.<hash>.jpg` to `state_00/images/0001.jpg`); where states have frames of one stem, a folder of
+    the export named after the state tells them apart. The classes that the capture declares keep their ids, others
+    follow in the export's order. Frames that the export does not label stay as they are.
+
+    Raises:
+        InputError: anything that cannot be read or written; labels that fit no frame, or not the frames' sizes.
+    """
+    capture = load_capture(path)
+    annotations = read_annotations(labels)
+    matches, unmatched = _match(capture, labels, annotations)
+    metas = _metas(capture)
+    parts = next((meta["semantic_classes"][1:] for meta in metas.values() if meta.get("semantic_classes")), [])
+    ids = _part_ids(labels, parts, annotations.classes)
+
+    def draw(match: _Match) -> np.ndarray:
+        camera, image = match.frame.camera, match.image
+        drawn = image.draw(camera.width, camera.height)
+        return ids[drawn]
+
+    taken: set[Path] = set()
+    for match in matches:
+        match.file = _label_file(match.root, match.frame, taken)
+        if not is_inside(path, match.file):
+            raise CaptureError(match.file.parent, "the folder is a link out of the capture", "remove the link")
+    with ThreadPoolExecutor() as pool:
+        for _ in pool.map(draw, matches):  # nothing is written before all shapes are known to make sense
+            pass
+        for _ in pool.map(lambda match: write_png(match.file, draw(match)), matches):
+            pass
+    files = {match.frame.image: match.file for match in matches}
+    for file, meta in metas.items():
+        for entry in meta["frames"]:
+            image = file.parent / relative_path(file, "file_path", entry.get("file_path"))
+            if image in files:
+                entry["semantics_path"] = files[image].relative_to(file.parent).as_posix()
+        meta["semantic_classes"] = ["background", *parts]
+        write_json(file, meta)
+    return LabelImport(
+        format=annotations.format,
+        labelled=len(matches),
+        frames=sum(len(state.frames) for state in capture.states),
+        parts=tuple(parts),
+        unmatched=tuple(unmatched),
+    )
+
+
+def _copy(source: Path, target: Path, output_dir: Path) -> None:
+    if is_inside(source, output_dir):
+        raise InputError(f"{output_dir}: lies inside {source}; give an output folder beside it.")
+
+    def left_out(folder: str, names: list[str]) -> list[str]:
+        paths = [Path(folder, name) for name in names]
+        kept = [p.is_file() and is_inside(source, p) or p.is_dir() and not p.is_symlink() for p in paths]
+        return [p.name for p, keep in zip(paths, kept, strict=True) if not keep]
+
+    try:
+        shutil.copytree(source, target, ignore=left_out, dirs_exist_ok=True)
+    except shutil.Error as error:
+        raise InputError(f"{error.args[0][0][0]}: cannot be copied; make it readable, and room on the disk.") from None
+
+
+# ---------------------------------------------------------------------------------------------- frames and classes
+
+
+@dataclass
+class _Match:
+    image: AnnotatedImage
+    frame: Frame
+    root: Path
+    """The folder that the frame's paths start from."""
+    file: Path = Path()
+    """Where its labels go."""
+
+
+def _match(capture: Capture, labels: Path, annotations: Annotations) -> tuple[list[_Match], list[str]]:
+    """The frame of every image of an export, and the names of the images that have none."""
+    named: dict[str, list[tuple[State, Frame]]] = {}
+    for state in capture.states:
+        for frame in state.frames:
+            path = PurePosixPath(frame.name).with_suffix("")
+            for key in {
+                _key(f"{state.name}/{path}"),
+                _key(str(path)),
+                _key(f"{state.name}/{path.name}"),
+                _key(path.name),
+            }:
+                named.setdefault(key, []).append((state, frame))
+    matches: dict[int, _Match] = {}
+    unmatched = []
+    for image in annotations.images:
+        path = _exported_path(image.name)
+        found = named.get(_key(str(path))) or named.get(_key(path.name), [])
+        if len(found) > 1:
+            found = [(s, f) for s, f in found if s.name in path.parts] or found
+        if len(found) > 1:
+            (a, first), (b, second) = found[:2]
+            raise CaptureError(
+                image.file,
+                f"{image.name!r} may be {a.name}/{first.name} or {b.name}/{second.name}",
+                f"put the labels of each state into a folder named after it, {a.name} for instance",
+            )
+        if not found:
+            unmatched.append(image.name)
+            continue
+        ((state, frame),) = found
+        folder = capture.path / state.name
+        match = _Match(image, frame, folder if (folder / TRANSFORMS).is_file() else capture.path)
+        _check_match(match, matches.get(id(frame)))
+        matches[id(frame)] = match
+    if not matches:
+        found = f"no frame of the capture has the name of {unmatched[0]!r} or of another labelled image"
+        raise CaptureError(labels, found, "keep the images' names when they are annotated")
+    return list(matches.values()), unmatched
+
+
+def _check_match(match: _Match, other: _Match | None) -> None:
+    image, frame = match.image, match.frame
+    if other is not None:
+        found = f"{other.image.name!r} and {image.name!r} both label the frame {frame.name}"
+        raise CaptureError(image.file, found, "export every image once, without augmentation")
+    if image.size is not None and image.size != (frame.camera.width, frame.camera.height):
+        found = "{!r} is {}x{} pixels".format(image.name, *image.size)
+        size = f"{frame.camera.width}x{frame.camera.height}"
+        mend = f"export it at the size of the frame {frame.name}, {size}, without resizing"
+        raise CaptureError(image.file, found, mend)
+
+
+def _key(name: str) -> str:
+    """A name as tools may have changed it: other cases, other signs between letters and digits."""
+    return re.sub(r"[\W_]+", "_", name.lower()).strip("_")
+
+
+def _exported_path(name: str) -> PurePosixPath:
+    """The path of an exported image without what tools append: `a/x_jpg.rf.<hash>.jpg` is `a/x`."""
+    path = PurePosixPath(name)
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        path = path.with_suffix("")
+    if found := re.fullmatch(r"(.+?)(_(png|jpe?g|webp|bmp|tiff?))?\.rf\.\w+", path.name, flags=re.IGNORECASE):
+        path = path.with_name(found[1])
+    return path
+
+
+def _part_ids(labels: Path, parts: list[str], classes: Sequence[str]) -> np.ndarray:
+    """The part id of every class, by its place from 1 on, uint8; new names are appended to `parts`."""
+    ids = [0]
+    for name in classes:
+        known = [part.lower() for part in parts]
+        if name.lower() in (*BACKGROUND_NAMES, *UNLABELLED_NAMES) and name.lower() not in known:
+            ids.append(0 if name.lower() in BACKGROUND_NAMES else UNLABELLED)
+            continue
+        if name.lower() not in known:
+            parts.append(name)
+        ids.append([part.lower() for part in parts].index(name.lower()) + 1)
+    if len(parts) > MAX_LABEL:
+        raise CaptureError(labels, f"there are {len(parts)} parts", f"label at most {MAX_LABEL}")
+    return np.array(ids, np.uint8)
+
+
+# ---------------------------------------------------------------------------------------------- transforms.json
+
+
+def _metas(capture: Capture) -> dict[Path, dict[str, Any]]:
+    """The content of the capture's transforms.json files; of PARIS's folders, what one beside them would hold."""
+    files = [path / TRANSFORMS for path in (capture.path, *(capture.path / state.name for state in capture.states))]
+    found = {file: read_json(file) for file in files if file.is_file()}
+    return found or {files[0]: _transforms(capture)}
+
+
+def _transforms(capture: Capture) -> dict[str, Any]:
+    """A transforms.json for all states that says what PARIS's own files say."""
+    frames = []
+    lists: dict[str, list[str]] = {"train_filenames": [], "val_filenames": [], "test_filenames": []}
+    for k, state in enumerate(capture.states):
+        for frame in state.frames:
+            camera, image = frame.camera, frame.image.relative_to(capture.path).as_posix()
+            entry = {
+                **{"file_path": image, "state": k, "transform_matrix": frame.T_world_camera.tolist()},
+                **{"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
+                **{"w": camera.width, "h": camera.height},
+            }
+            if frame.labels is not None:
+                entry["semantics_path"] = frame.labels.relative_to(capture.path).as_posix()
+            frames.append(entry)
+            lists[f"{frame.split}_filenames"].append(image)
+    return {"camera_model": "PINHOLE", **lists, "frames": frames}
+
+
+def _label_file(root: Path, frame: Frame, taken: set[Path]) -> Path:
+    """semantics/0001.png for images/0001.jpg; no two frames get the same."""
+    parts = [part for part in Path(os.path.relpath(frame.image, root)).parts if part != ".."]
+    name = PurePosixPath(*(parts[1:] if len(parts) > 1 and parts[0] == "images" else parts))
+    file = root / "semantics" / name.with_suffix(".png")
+    if file in taken:
+        file = root / "semantics" / f"{name}.png"
+    taken.add(file)
+    return file

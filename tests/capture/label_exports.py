@@ -1,0 +1,100 @@
+"""Exports of annotation tools, made from a capture's own labels."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from pycocotools import mask as coco
+
+from splatart_ns.capture.capture import Capture, Frame, State
+from splatart_ns.capture.images import read_labels
+
+Naming = Callable[[State, Frame], str]
+
+
+def flat_name(state: State, frame: Frame) -> str:
+    """As people name images before they upload them: state_00_0001.png."""
+    return f"{state.name}_{Path(frame.name).name}"
+
+
+def roboflow_name(state: State, frame: Frame) -> str:
+    name = Path(flat_name(state, frame))
+    return f"{name.stem}_{name.suffix[1:]}.rf.9f3c1a{abs(hash(frame.name)) % 1000:03d}.jpg"
+
+
+def outlines(mask: np.ndarray) -> list[list[float]]:
+    """Polygons along the pixel borders of a mask: a rectangle for each run of pixels in a row."""
+    polygons = []
+    for y, row in enumerate(mask):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
+        for x0, x1 in edges.reshape(-1, 2).tolist():
+            polygons.append([x0, y, x1, y, x1, y + 1, x0, y + 1])
+    return polygons
+
+
+def _labelled(capture: Capture) -> Iterator[tuple[State, Frame, np.ndarray]]:
+    for state in capture.states:
+        for frame in state.frames:
+            if frame.labels is not None:
+                yield state, frame, read_labels(frame.labels)
+
+
+def write_coco(capture: Capture, file: Path, shapes: str, name: Naming = flat_name) -> Path:
+    """`shapes` is "polygons", "runs" or "compressed"."""
+    images, annotations = [], []
+    for number, (state, frame, labels) in enumerate(_labelled(capture), start=1):
+        height, width = labels.shape
+        images.append({"id": number, "file_name": name(state, frame), "width": width, "height": height})
+        for part in sorted(set(np.unique(labels).tolist()) - {0}):
+            mask = labels == part
+            if shapes == "polygons":
+                segmentation = outlines(mask)
+            elif shapes == "runs":
+                column = mask.T.ravel()
+                starts = np.flatnonzero(np.diff(column, prepend=~column[:1]))
+                counts = np.diff(starts, append=len(column)).tolist()
+                segmentation = {"counts": [0, *counts] if column[0] else counts, "size": [height, width]}
+            else:
+                segmentation = coco.encode(np.asfortranarray(mask.astype(np.uint8)))
+                segmentation["counts"] = segmentation["counts"].decode()
+            annotations.append({"image_id": number, "category_id": part, "segmentation": segmentation, "iscrowd": 0})
+    # Roboflow's way: the project first, as the category of all others.
+    categories = [{"id": 0, "name": "my-parts", "supercategory": "none"}]
+    categories += [{"id": i, "name": part, "supercategory": "my-parts"} for i, part in capture.parts.items()]
+    categories.append({"id": 255, "name": "unlabelled", "supercategory": "my-parts"})
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps({"images": images, "categories": categories, "annotations": annotations}))
+    return file
+
+
+def write_yolo(capture: Capture, folder: Path, name: Naming = flat_name, digits: int = 6) -> Path:
+    (folder / "train/labels").mkdir(parents=True)
+    names = [*capture.parts.values(), "ignore"]
+    (folder / "data.yaml").write_text(f"train: ../train/images\nnc: {len(names)}\nnames: {json.dumps(names)}\n")
+    (folder / "README.roboflow.txt").write_text("exported\n")
+    for state, frame, labels in _labelled(capture):
+        height, width = labels.shape
+        lines = []
+        for part in sorted(set(np.unique(labels).tolist()) - {0}):
+            for polygon in outlines(labels == part):
+                numbers = np.array(polygon).reshape(-1, 2) / [width, height]
+                number = len(names) - 1 if part == 255 else part - 1
+                lines.append(" ".join([str(number), *(f"{x:.{digits}f}" for x in numbers.ravel())]))
+        file = folder / "train/labels" / f"{Path(name(state, frame)).stem}.txt"
+        file.write_text("\n".join(lines))
+    return folder
+
+
+def write_masks(capture: Capture, folder: Path, name: Naming = roboflow_name) -> Path:
+    (folder / "train").mkdir(parents=True)
+    rows = ["Pixel Value, Class", "0, background", *(f"{i}, {part}" for i, part in capture.parts.items())]
+    (folder / "train/_classes.csv").write_text("\n".join(rows) + "\n")
+    for state, frame, labels in _labelled(capture):
+        stem = Path(name(state, frame)).stem
+        (folder / "train" / f"{stem}.jpg").write_bytes(frame.image.read_bytes())
+        assert cv2.imwrite(str(folder / "train" / f"{stem}_mask.png"), labels)
+    return folder

@@ -1,0 +1,194 @@
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from splatart_ns.capture.examination import as_json, as_text, examine
+
+
+@pytest.fixture
+def capture(hinge_capture, tmp_path):
+    return shutil.copytree(hinge_capture, tmp_path / "capture")
+
+
+def change_png(file, change):
+    assert cv2.imwrite(str(file), np.ascontiguousarray(change(cv2.imread(str(file), cv2.IMREAD_UNCHANGED))))
+
+
+def change_all(folder, change):
+    for file in folder.glob("*.png"):
+        change_png(file, change)
+
+
+def change_json(file, change):
+    meta = json.loads(file.read_text())
+    change(meta)
+    file.write_text(json.dumps(meta))
+
+
+def change_poses(state, change):
+    def apply(meta):
+        for frame in meta["frames"]:
+            frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+
+    change_json(state / "transforms.json", apply)
+
+
+def swapped(labels):
+    return np.select([labels == 1, labels == 2], [2, 1], labels).astype(np.uint8)
+
+
+def left_half(mask):
+    return mask * (np.arange(mask.shape[1]) < mask.shape[1] // 2).astype(np.uint8)
+
+
+def pose_of_another(meta):
+    meta["frames"][5]["transform_matrix"] = meta["frames"][9]["transform_matrix"]
+
+
+def another_world(T):
+    out = T.copy()
+    R = Rotation.from_rotvec([0.3, 1.0, 0.5]).as_matrix()
+    out[:3, :3], out[:3, 3] = R @ T[:3, :3], 1.3 * R @ T[:3, 3] + [0.5, -0.3, 0.2]
+    return out
+
+
+def labelled_once(labels):
+    return np.where(labels == 2, 255, labels).astype(np.uint8)
+
+
+LABELS = "state_01/semantics/0005.png"
+MASK = "state_01/masks/0005.png"
+DEFECTS = {
+    "labels of two parts swapped in one frame": (
+        lambda c: change_png(c / LABELS, swapped),
+        {LABELS: "the labels of images/0005.png contradict the other frames on"},
+    ),
+    "labels shifted in one frame": (
+        lambda c: change_png(c / LABELS, lambda labels: np.roll(labels, 4, axis=1)),
+        {LABELS: "the labels of images/0005.png do not fit its silhouette"},
+    ),
+    "all labels too large": (
+        lambda c: change_all(c / "state_01/semantics", lambda labels: cv2.dilate(labels, np.ones((5, 5), np.uint8))),
+        {"state_01": "the outlines of labels and silhouettes lie"},
+    ),
+    "a part labelled in one frame": (
+        lambda c: [change_png(f, labelled_once) for f in sorted((c / "state_01/semantics").iterdir())[1:]],
+        {"state_01": "part 2 (lid) is seen in 1 labelled training frame"},
+    ),
+    "the pose of another frame": (
+        lambda c: change_json(c / "state_01/transforms.json", pose_of_another),
+        {MASK: "the silhouette of images/0005.png does not fit those of the other frames"},
+    ),
+    "half of a mask": (
+        lambda c: change_png(c / MASK, left_half),
+        {MASK: "the silhouette of images/0005.png does not fit those of the other frames"},
+    ),
+    "poses in OpenCV's axes": (
+        lambda c: change_poses(c / "state_01", lambda T: T @ np.diag([1.0, -1.0, -1.0, 1.0])),
+        {"state_01": "the silhouettes contradict each other: no point lies inside more than"},
+    ),
+    "poses world to camera": (
+        lambda c: change_poses(c / "state_01", np.linalg.inv),
+        {"state_01": "the silhouettes contradict each other: no point lies inside more than"},
+    ),
+    "masks inverted": (
+        lambda c: change_all(c / "state_01/masks", lambda mask: 255 - mask),
+        {"state_01": "the silhouettes"},
+    ),
+    "a state in another world": (
+        lambda c: change_poses(c / "state_01", another_world),
+        {"state_01": "no part is where it was in state_00: the states may have different worlds"},
+    ),
+    "a state in another scale": (
+        lambda c: change_poses(c / "state_01", lambda T: np.block([[T[:3, :3], 2 * T[:3, 3:]], [T[3:]]])),
+        {"state_01": "no part is where it was in state_00: the states may have different worlds"},
+    ),
+    "no motion": (
+        lambda c: [shutil.rmtree(c / "state_01"), shutil.copytree(c / "state_00", c / "state_01")],
+        {"state_01": "no part seems to have moved since state_00"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_a_defect_is_told_and_its_frame_named(capture, name):
+    spoil, expected = DEFECTS[name]
+    spoil(capture)
+    problems = examine(capture).problems
+    for file, words in expected.items():
+        assert [p for p in problems if p.file == capture / file and p.message.startswith(words)], problems
+    assert all(p.mend for p in problems)
+    blamed = {str(p.file.relative_to(capture)) for p in problems if p.file.suffix == ".png"}
+    assert blamed <= set(expected)
+
+
+def test_a_sound_capture_has_no_problems_and_its_parts_are_counted(hinge_capture):
+    examination = examine(hinge_capture)
+    assert examination.problems == () and examination.errors == 0
+    assert [(c.state, c.part, c.frames, c.labelled) for c in examination.coverage] == [
+        ("state_00", "base", 12, 12),
+        ("state_01", "base", 12, 12),
+        ("state_00", "lid", 12, 12),
+        ("state_01", "lid", 12, 12),
+    ]
+    lines = as_text(examination).splitlines()
+    assert lines[0].split() == ["seen", "in", "labelled", "frames", "state_00", "state_01"]
+    assert lines[-1] == "0 errors, 0 warnings"
+
+
+def unlabel(capture, state, numbers):
+    change_json(
+        capture / state / "transforms.json",
+        lambda meta: [meta["frames"][i].pop("semantics_path") for i in numbers],
+    )
+
+
+def test_silhouettes_may_come_from_the_labels(capture):
+    for state in ("state_00", "state_01"):
+        change_json(
+            capture / state / "transforms.json",
+            lambda meta: [frame.pop("object_mask_path") for frame in meta["frames"]],
+        )
+        change_all(capture / state / "images", lambda image: image[..., :3])
+    assert examine(capture).problems == ()
+    change_png(capture / LABELS, lambda labels: np.roll(labels, 6, axis=1))
+    assert [p.file.name for p in examine(capture).problems] == ["0005.png"]
+
+
+def test_the_frame_that_shows_what_no_labelled_frame_shows_is_suggested(capture):
+    unlabel(capture, "state_00", range(12))
+    unlabel(capture, "state_01", range(1, 12))
+    suggested = examine(capture, suggest=4).suggested
+    assert len(suggested) == len({frame.image for frame in suggested}) == 4
+    states = [frame.image.parts[-3] for frame in suggested]
+    assert states.count("state_00") >= 2  # it has no labelled train frame yet
+    assert all(frame.split == "train" and frame.labels is None for frame in suggested)
+    # The first one of a state without labels stands where most of the object is seen; the next one on another side.
+    first, second = [f.T_world_camera[:3, 2] for f in suggested if f.image.parts[-3] == "state_00"][:2]
+    assert first @ second < 0.5
+
+
+def test_nothing_is_suggested_where_all_is_labelled(hinge_capture):
+    assert examine(hinge_capture, suggest=3).suggested == ()
+
+
+def test_json_says_the_same(capture):
+    change_png(capture / LABELS, swapped)
+    unlabel(capture, "state_00", range(6))
+    examination = examine(capture, suggest=1)
+    value = json.loads(as_json(examination))
+    assert value["errors"] == 0 and len(value["problems"]) == len(examination.problems) == 1
+    assert value["problems"][0]["severity"] == "warning"
+    assert value["problems"][0]["file"] == str(capture / LABELS)
+    assert value["label_next"] == [str(examination.suggested[0].image)]
+    assert value["coverage"][0] == {"state": "state_00", "part": "base", "frames": 6, "labelled": 6}
+
+
+def test_what_is_no_capture_is_one_problem(tmp_path):
+    examination = examine(tmp_path)
+    assert examination.capture is None and examination.errors == len(examination.problems) == 1
+    assert as_text(examination).endswith("1 errors, 0 warnings")

@@ -1,0 +1,274 @@
+import dataclasses
+import json
+import os
+
+import cv2
+import numpy as np
+import pytest
+from label_exports import flat_name, roboflow_name, write_coco, write_masks, write_yolo
+
+from splatart_ns.capture.check import check_capture
+from splatart_ns.capture.formats import load_capture
+from splatart_ns.capture.images import read_labels
+from splatart_ns.capture.label_import import import_capture, import_labels
+from splatart_ns.errors import InputError
+
+
+def without_labels(path):
+    """The capture without any label."""
+    for file in path.rglob("*.png"):
+        if "labels" in file.parent.name or "semantics" in file.parent.name:
+            file.unlink()
+    for file in path.rglob("transforms.json"):
+        meta = json.loads(file.read_text())
+        meta.pop("semantic_classes", None)
+        for entry in meta["frames"]:
+            entry.pop("semantics_path")
+        file.write_text(json.dumps(meta))
+    return path
+
+
+def ragged(capture):
+    """Labels with holes, single pixels and unlabelled ones, another in every frame."""
+    rng = np.random.default_rng(0)
+    for state in capture.states:
+        for frame in state.frames:
+            labels = read_labels(frame.labels)
+            labels[rng.random(labels.shape) < 0.1] = 1
+            labels[rng.random(labels.shape) < 0.1] = 2
+            labels[rng.random(labels.shape) < 0.1] = 255
+            cv2.imwrite(str(frame.labels), labels)
+    return capture
+
+
+def all_labels(path):
+    capture = load_capture(path)
+    return {
+        (state, frame.image.parts[-2:], frame.split): read_labels(frame.labels).tolist()
+        for state, frames in enumerate(s.frames for s in capture.states)
+        for frame in frames
+        if frame.labels is not None
+    }
+
+
+EXPORTS = {
+    "COCO polygons": lambda c, out: write_coco(c, out / "_annotations.coco.json", "polygons"),
+    "COCO runs": lambda c, out: write_coco(c, out / "instances.json", "runs"),
+    "COCO compressed runs": lambda c, out: write_coco(c, out / "a/_annotations.coco.json", "compressed", roboflow_name),
+    "COCO folder": lambda c, out: write_coco(c, out / "train/_annotations.coco.json", "runs").parents[1],
+    "YOLO": write_yolo,
+    "YOLO of Roboflow": lambda c, out: write_yolo(c, out, roboflow_name),
+    "masks": lambda c, out: write_masks(c, out, flat_name),
+    "masks of Roboflow": write_masks,
+}
+
+
+def bit_for_bit(path, tmp_path, write):
+    capture = ragged(load_capture(path))
+    truth = all_labels(path)
+    export = write(capture)
+    without_labels(path)
+    done = import_capture([path], tmp_path / "new", export)
+    assert all_labels(tmp_path / "new") == truth
+    assert (done.labelled, done.frames, done.unmatched) == (len(truth), len(truth), ())
+    assert load_capture(tmp_path / "new").parts == capture.parts
+    assert all_labels(path) == {}
+
+
+@pytest.mark.parametrize("layout", ["capture_folder", "single_file_folder"])
+@pytest.mark.parametrize("name", EXPORTS)
+def test_labels_come_back_bit_for_bit(request, tmp_path, layout, name):
+    bit_for_bit(request.getfixturevalue(layout), tmp_path, lambda c: EXPORTS[name](c, tmp_path / "export"))
+
+
+@pytest.mark.parametrize("write", [write_yolo, write_masks])
+def test_labels_of_paris_come_back_bit_for_bit(paris_folder, tmp_path, write):
+    def whole_path(state, frame):  # its splits may count from 0 each
+        return f"{state.name}_{frame.name.replace('/', '_')}"
+
+    bit_for_bit(paris_folder, tmp_path, lambda c: write(c, tmp_path / "export", whole_path))
+
+
+def test_an_export_of_each_state_lies_in_a_folder_of_its_name(capture_folder, tmp_path):
+    truth = all_labels(capture_folder)
+    capture = load_capture(capture_folder)
+    for state in capture.states:
+        one = dataclasses.replace(capture, states=(state,))
+        file = tmp_path / f"export/{state.name}/result.json"
+        write_coco(one, file, "runs", lambda state, frame: frame.image.name)
+    without_labels(capture_folder)
+    import_capture([capture_folder], tmp_path / "new", tmp_path / "export")
+    assert all_labels(tmp_path / "new") == truth
+
+
+def test_folders_of_single_states_become_one_capture(capture_folder, tmp_path):
+    truth = {(1 - k, *rest): labels for (k, *rest), labels in all_labels(capture_folder).items()}
+    scans = capture_folder.rename(tmp_path / "scans")
+    sources = [scans / "state_01", scans / "state_00"]
+    assert import_capture(sources, tmp_path / "new") is None
+    assert [s.name for s in load_capture(tmp_path / "new").states] == ["state_00", "state_01"]
+    assert all_labels(tmp_path / "new") == truth
+    assert check_capture(tmp_path / "new") == []
+
+
+def test_labels_go_into_the_capture_itself_only_on_request(capture_folder, tmp_path):
+    truth = all_labels(capture_folder)
+    export = write_coco(load_capture(capture_folder), tmp_path / "labels.json", "polygons")
+    without_labels(capture_folder)
+    import_labels(capture_folder, export)
+    assert all_labels(capture_folder) == truth
+    meta = json.loads((capture_folder / "state_00/transforms.json").read_text())
+    assert meta["frames"][3]["semantics_path"] == "semantics/0003.png"
+    assert meta["semantic_classes"] == ["background", "base", "door"]
+
+
+def test_a_few_labelled_frames_leave_the_others_as_they_are(capture_folder, tmp_path):
+    export = write_masks(load_capture(capture_folder), tmp_path / "export", flat_name)
+    for file in sorted(export.glob("train/state_0?_000[3-7]_mask.png")):
+        file.unlink()
+    without_labels(capture_folder)
+    done = import_capture([capture_folder], tmp_path / "new", export)
+    assert (done.labelled, done.frames) == (6, 16)
+    assert len(all_labels(tmp_path / "new")) == 6
+
+
+def test_declared_parts_keep_their_ids_and_new_ones_follow(capture_folder, tmp_path, edit):
+    export = write_yolo(load_capture(capture_folder), tmp_path / "export")
+    (export / "data.yaml").write_text("names:\n  0: Door\n  1: handle\n")
+    import_labels(capture_folder, export)
+    capture = load_capture(capture_folder)
+    assert capture.parts == {1: "base", 2: "door", 3: "handle"}
+    assert set(np.unique(read_labels(capture.states[0].frames[0].labels))) == {0, 2, 3}
+
+
+def test_images_without_a_frame_are_told(capture_folder, tmp_path, edit):
+    export = write_coco(load_capture(capture_folder), tmp_path / "labels.json", "runs")
+    edit(export, lambda e: e["images"][0].update(file_name="elsewhere.png"))
+    assert import_labels(capture_folder, export).unmatched == ("elsewhere.png",)
+
+
+def change_coco(change):
+    def make(capture, folder):
+        file = write_coco(capture, folder / "labels.json", "runs")
+        content = json.loads(file.read_text())
+        change(content)
+        file.write_text(json.dumps(content))
+        return file
+
+    return make
+
+
+def change_text(pattern, text):
+    def make(capture, folder):
+        (file, *_) = write_yolo(capture, folder).glob(pattern)
+        file.write_text(text)
+        return folder
+
+    return make
+
+
+def segmentation(value):
+    return change_coco(lambda e: e["annotations"][0].update(segmentation=value))
+
+
+BAD_EXPORTS = {
+    "resized": (change_coco(lambda e: e["images"][0].update(width=640)), "640x16 pixels; export it at the size"),
+    "no name fits": (change_coco(lambda e: [i.update(file_name=f"a{i['id']}") for i in e["images"]]), "no frame"),
+    "ambiguous": (change_coco(lambda e: e["images"][0].update(file_name="0000.png")), "'0000.png' may be state_00/"),
+    "augmented": (change_coco(lambda e: e["images"][1].update(file_name="state_00_0000_png.rf.x.jpg")), "both label"),
+    "box": (segmentation([]), "not boxes"),
+    "two corners": (segmentation([[1, 2, 3, 4]]), "three corners"),
+    "corner of text": (segmentation([[1, 2, 3, 4, "x", 5]]), "a coordinate of a segmentation"),
+    "runs of another size": (segmentation({"size": [4, 4], "counts": [16]}), "is {'counts': [16]"),
+    "runs too long": (segmentation({"size": [16, 16], "counts": [10**12]}), "do not fill"),
+    "negative runs": (segmentation({"size": [16, 16], "counts": [300, -44]}), "do not fill"),
+    "damaged runs": (segmentation({"size": [16, 16], "counts": "\u00e9"}), "damaged"),
+    "runs cut off": (segmentation({"size": [16, 16], "counts": "o"}), "cut off"),
+    "runs of endless numbers": (segmentation({"size": [16, 16], "counts": "o" * 10**5}), "damaged"),
+    "unknown category": (change_coco(lambda e: e["annotations"][0].update(category_id=9)), "category_id 9"),
+    "unknown image": (change_coco(lambda e: e["annotations"][0].update(image_id=99)), "image_id 99"),
+    "no annotations": (change_coco(lambda e: e.update(annotations=[])), "labels no image"),
+    "annotations of text": (change_coco(lambda e: e.update(annotations=["x"])), "annotations[0] is 'x'"),
+    "YOLO boxes": (change_text("train/labels/*0003.txt", "0 0.5 0.5 0.1 0.1"), "a box is no polygon"),
+    "YOLO pixels": (change_text("train/labels/*0003.txt", "0 5 5 9 9 5 9"), "divide them"),
+    "YOLO words": (change_text("train/labels/*0003.txt", "door 0.5 0.5 0.1 0.1"), "line 1 is 'door"),
+    "YOLO class": (change_text("train/labels/*0003.txt", "7 0.1 0.1 0.2 0.1 0.2 0.2"), "class 7 of 3"),
+    "YOLO without NaN": (change_text("train/labels/*0003.txt", "0 nan 0.1 0.2 0.1 0.2 0.2"), "nan"),
+    "YAML with code": (change_text("data.yaml", "names: !!python/object/apply:os.getcwd []"), "not YAML"),
+    "YAML without names": (change_text("data.yaml", "names: 3"), "names is 3"),
+    "nothing": (lambda c, folder: folder, "there are no labels here"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_EXPORTS)
+def test_what_cannot_be_imported_is_named_and_nothing_written(capture_folder, tmp_path, name):
+    make, words = BAD_EXPORTS[name]
+    export = make(load_capture(capture_folder), tmp_path / "export")
+    with pytest.raises(InputError) as error:
+        import_capture([capture_folder], tmp_path / "new", export)
+    assert words in str(error.value) and str(tmp_path / "export") in str(error.value)
+    assert {f.name for f in tmp_path.iterdir()} <= {"capture", "export"}
+
+
+def test_masks_need_classes_for_all_their_values(capture_folder, tmp_path):
+    export = write_masks(load_capture(capture_folder), tmp_path / "export", flat_name)
+    (export / "train/_classes.csv").write_text("Pixel Value, Class\n0, background\n1, base\n")
+    with pytest.raises(InputError, match=r"_mask\.png: no class has the value 2"):
+        import_labels(capture_folder, export)
+    (export / "train/_classes.csv").unlink()
+    with pytest.raises(InputError, match="the names of the classes are missing"):
+        import_labels(capture_folder, export)
+    (export / "classes.txt").write_text("base\ndoor\n")
+    assert import_labels(capture_folder, export).parts == ("base", "door")
+
+
+def test_links_out_of_a_source_are_not_followed(capture_folder, tmp_path):
+    (tmp_path / "secret.png").write_bytes(b"secret")
+    os.symlink(tmp_path / "secret.png", capture_folder / "secret.png")
+    os.symlink("/", capture_folder / "root")
+    os.symlink("images/0001.png", capture_folder / "state_00/inside.png")
+    os.mkfifo(capture_folder / "pipe")
+    import_capture([capture_folder], tmp_path / "new", write_export(capture_folder, tmp_path))
+    assert {f.name for f in (tmp_path / "new").iterdir()} == {"state_00", "state_01"}
+    assert (tmp_path / "new/state_00/inside.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_labels_are_not_written_through_a_link_out_of_the_capture(capture_folder, tmp_path):
+    export = write_export(capture_folder, tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    os.symlink(tmp_path / "elsewhere", capture_folder / "state_00/semantics")
+    with pytest.raises(InputError, match="a link out of the capture"):
+        import_labels(capture_folder, export)
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+def write_export(path, tmp_path):
+    return write_coco(load_capture(path), tmp_path / "labels.json", "runs")
+
+
+def test_the_output_folder_may_not_be_in_use_nor_inside_the_source(capture_folder, tmp_path):
+    export = write_export(capture_folder, tmp_path)
+    with pytest.raises(InputError, match="not empty"):
+        import_capture([capture_folder], capture_folder, export)
+    with pytest.raises(InputError, match="lies inside"):
+        import_capture([capture_folder], capture_folder / "new", export)
+    assert sorted(f.name for f in capture_folder.iterdir()) == ["state_00", "state_01"]
+
+
+def test_the_command_says_what_it_did(run_main, capture_folder, tmp_path):
+    export = write_export(capture_folder, tmp_path)
+    code, output, errors = run_main("import", capture_folder, "--labels", export, "--output-dir", tmp_path / "new")
+    assert (code, errors) == (0, "")
+    assert output == f"Labels: COCO, 16 of 16 frames; parts: base, door\nCapture: {tmp_path / 'new'}\n"
+    assert run_main("import", capture_folder, "--labels", export, "--in-place")[0] == 0
+    states = [capture_folder / "state_00", capture_folder / "state_01"]
+    assert run_main("import", *states, "--output-dir", tmp_path / "two")[0] == 0
+    assert all_labels(tmp_path / "two") == all_labels(capture_folder)
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["a"], ["a", "--in-place"], ["a", "b"], ["a", "--output-dir", "new"]], ids=str
+)
+def test_the_command_needs_a_source_a_target_and_something_to_import(run_main, arguments):
+    code, _, errors = run_main("import", *arguments)
+    assert code == 2 and errors.startswith("error: ") and "--output-dir" in errors or "--labels" in errors

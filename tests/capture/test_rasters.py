@@ -1,0 +1,65 @@
+import cv2
+import numpy as np
+import pytest
+from pycocotools import mask as coco
+
+from splatart_ns.capture import rasters
+from splatart_ns.capture.rasters import decode_runs, decompress_runs
+
+
+def fill_polygon(corners, width, height):
+    image = np.zeros((height, width), np.uint8)
+    rasters.fill_polygon(image, corners, 1)
+    return image.astype(bool)
+
+
+def test_a_polygon_takes_the_pixels_whose_centre_it_holds():
+    corners = np.array([[1.0, 1.0], [4.0, 1.0], [4.0, 3.0], [1.0, 3.0]])
+    expected = np.zeros((5, 6), bool)
+    expected[1:3, 1:4] = True
+    for around in (corners, corners[::-1], np.roll(corners, 1, axis=0), corners + 0.49, corners - 0.49):
+        np.testing.assert_array_equal(fill_polygon(around, 6, 5), expected)
+
+
+def test_a_polygon_agrees_with_the_centres_tested_one_by_one():
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:40, :50] + 0.5
+    for n in (3, 5, 9, 600):
+        corners = rng.uniform(-20, 70, (n, 2))
+        crossings = np.zeros((40, 50), int)
+        for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                crossings += ((y0 > y) != (y1 > y)) & (x > x0 + (y - y0) / (y1 - y0) * (x1 - x0))
+        np.testing.assert_array_equal(fill_polygon(corners, 50, 40), crossings % 2 == 1)
+
+
+def test_polygons_that_share_edges_leave_no_gap_and_share_no_pixel():
+    rng = np.random.default_rng(0)
+    middle = rng.uniform(10, 20, 2)
+    rim = np.array([[0.0, 0.0], [30.0, 0.0], [30.0, 30.0], [0.0, 30.0]])
+    fan = [np.stack([middle, rim[i], rim[(i + 1) % 4]]) for i in range(4)]
+    np.testing.assert_array_equal(sum(fill_polygon(c, 30, 30).astype(int) for c in fan), 1)
+
+
+@pytest.mark.parametrize("far", [1e11, -1e11])
+def test_a_polygon_far_away_or_empty_has_no_pixel(far):
+    assert not fill_polygon(np.array([[far, far], [far + 9, far], [far, far + 9]]), 8, 8).any()
+    assert not fill_polygon(np.full((3, 2), 2.5), 8, 8).any()
+
+
+def test_polygons_agree_with_pycocotools_but_for_pixels_on_the_edge():
+    angle = np.linspace(0, 2 * np.pi, 30)[:-1]
+    corners = 50 + np.stack([40 * np.cos(angle), 30 * np.sin(angle)], axis=1)
+    theirs = coco.decode(coco.frPyObjects([corners.ravel().tolist()], 100, 100))[..., 0].astype(bool)
+    differ = fill_polygon(corners, 100, 100) != theirs
+    edge = cv2.polylines(np.zeros((100, 100), np.uint8), [np.rint(corners).astype(np.int32)], True, 1, 3)
+    assert not differ[edge == 0].any() and differ.sum() < 200
+
+
+@pytest.mark.parametrize("shape", [(7, 5), (1, 1), (1, 300), (300, 1), (200, 180)])
+def test_runs_agree_with_pycocotools(shape):
+    rng = np.random.default_rng(0)
+    for density in (0.0, 0.01, 0.5, 1.0):
+        mask = rng.random(shape) < density
+        text = coco.encode(np.asfortranarray(mask.astype(np.uint8)))["counts"].decode()
+        np.testing.assert_array_equal(decode_runs(decompress_runs(text), shape[1], shape[0]), mask)
