@@ -340,6 +340,10 @@ def main() -> None:
     commands |= {"export": export, "synth": synth, "demo": demo}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="splatart", description=__doc__)
+        sys.stdout.flush()
+    except BrokenPipeError:  # as of `splatart check CAPTURE | head`; what is left to print has nowhere to go
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        raise SystemExit(141) from None
     except InputError as error:
         message = str(error)
         print(f"error: {message}" + ("" if message.endswith(".") else "."), file=sys.stderr)

@@ -69,6 +69,13 @@ def test_check_has_nothing_to_say_about_a_sound_capture(run_main, hinge_capture)
     ]
 
 
+def test_a_reader_that_stops_reading_ends_the_command_quietly(start_splatart, hinge_capture):
+    process = start_splatart("check", hinge_capture, "--json")
+    process.stdout.close()
+    assert process.stderr.read() == ""
+    assert process.wait() == 141
+
+
 def test_check_tells_all_problems(run_main, hinge_capture, tmp_path):
     capture = shutil.copytree(hinge_capture, tmp_path / "capture")
     (capture / "state_00/images/0001.png").unlink()

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from splatart_ns.capture.capture import UNLABELLED
+from splatart_ns.capture.hull import project, widened
 from splatart_ns.capture.view import View
-from splatart_ns.geometry.camera import project_points
 
 MIN_POINTS_PER_PART = {2: 2000, 6: 1000}
 """Least number of points of a part, by the number of parts up to which it holds."""
@@ -37,23 +36,12 @@ def carve(views: Sequence[View], grid: Tensor, dilate: int) -> Tensor:
     inside = torch.ones(len(grid), dtype=torch.bool)
     seen = torch.zeros(len(grid), dtype=torch.bool)
     for view in views:
-        silhouette = (view.alpha > 127).float()[None, None]
-        border = torch.cat([*silhouette[0, 0, [0, -1]], *silhouette[0, 0, :, [0, -1]].T])
-        whole = not bool(border.any())
-        if dilate > 0:
-            silhouette = F.max_pool2d(silhouette, 2 * dilate + 1, stride=1, padding=dilate)
-        u, v, visible = _project(view, grid)
+        silhouette = view.alpha > 127
+        border = torch.cat([*silhouette[[0, -1]], *silhouette[:, [0, -1]].T])
+        column, row, _, visible = project(view, grid)
         seen |= visible
-        inside &= torch.where(visible, silhouette[0, 0, v, u] > 0, not whole)
+        inside &= torch.where(visible, widened(silhouette, dilate)[row, column], border.any())
     return inside & seen
-
-
-def _project(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixel column and row [N] (clamped into the image) and whether the point falls into it."""
-    pixels, depth = project_points(points, view.viewmat, view.K)
-    u, v = pixels.floor().unbind(-1)
-    visible = (depth > 0) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
-    return u.clamp(0, view.width - 1).long(), v.clamp(0, view.height - 1).long(), visible
 
 
 def visual_hull(views: Sequence[View], resolution: int = 96) -> tuple[Tensor, float] | None:
@@ -112,8 +100,8 @@ def vote_by_projection(views: Sequence[View], points: Tensor, num_parts: int) ->
     for view in views:
         if view.labels is None:
             continue
-        u, v, visible = _project(view, points)
-        label = view.labels[v, u].long()
+        column, row, _, visible = project(view, points)
+        label = view.labels[row, column].long()
         counts = visible & (label != UNLABELLED) & (label > 0)
         votes[rows[counts], label[counts]] += 1
     return votes.argmax(-1)
@@ -123,8 +111,8 @@ def _mean_colours(views: Sequence[View], points: Tensor) -> Tensor:
     """Mean colour [N, 3], 0..255, over the views in whose silhouette a point falls; grey where there is none."""
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
     for view in views:
-        u, v, visible = _project(view, points)
-        inside = (visible & (view.alpha[v, u] > 127)).float()[:, None]
-        total += inside * view.rgb[v, u].float()
+        column, row, _, visible = project(view, points)
+        inside = (visible & (view.alpha[row, column] > 127)).float()[:, None]
+        total += inside * view.rgb[row, column].float()
         weight += inside
     return torch.where(weight > 0, total / weight.clamp_min(1), torch.full_like(total, 127.5))
