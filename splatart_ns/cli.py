@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import shutil
@@ -131,6 +132,32 @@ def _check_numbers(
     for name, (value, mend, is_wrong) in wrong.items():
         if is_wrong:
             raise InputError(f"--{name} is {value}; give {mend}.")
+
+
+def view(
+    bundle: Annotated[Path, tyro.conf.Positional],
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    rasterizer: Rasterizer = "auto",
+) -> None:
+    """Open a bundle in the browser: move its joints, hide parts, play a sweep, save what you see.
+
+    Args:
+        bundle: Folder that `splatart fit` left.
+        host: Address to listen on; 0.0.0.0 lets other machines in, who need no password.
+        port: Port of the page, 1 to 65535.
+        rasterizer: As in `splatart fit`.
+    """
+    from splatart_ns.bundle import load_bundle
+    from splatart_ns.viewer.viewer import Viewer
+
+    if not 0 < port < 65536:
+        raise InputError(f"--port is {port}; give 1 to 65535.")
+    _choose_rasterizer(rasterizer)
+    viewer = Viewer(load_bundle(bundle), host, port)
+    CONSOLE.print(f"Open http://{host}:{port} in a browser. Ctrl-C ends.")
+    with contextlib.suppress(KeyboardInterrupt):
+        viewer.run()
 
 
 def evaluate(bundle: Annotated[Path, tyro.conf.Positional], data: Path, rasterizer: Rasterizer = "auto") -> None:
@@ -336,7 +363,7 @@ def main() -> None:
     # Nerfstudio's own, which its users cannot mend.
     warnings.filterwarnings("ignore", category=FutureWarning)
     warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True")
-    commands = {"fit": fit, "render": render, "eval": evaluate, "check": check, "import": import_capture}
+    commands = {"fit": fit, "render": render, "view": view, "eval": evaluate, "check": check, "import": import_capture}
     commands |= {"export": export, "synth": synth, "demo": demo}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="splatart", description=__doc__)

@@ -21,9 +21,10 @@ BELOW = {
 }
 BELOW["bundle"] = BELOW["stages"] | {"files", "records", "stages"}
 BELOW["evaluation"] = BELOW["bundle"] | {"bundle"}
+BELOW["viewer"] = BELOW["bundle"] | {"bundle"}
 BELOW["plugin"] = BELOW["bundle"] | {"bundle"}
 BELOW["method_configs"] = {"plugin"}
-BELOW["cli"] = {"bundle", "capture", "errors", "evaluation", "plugin", "rasterize"}
+BELOW["cli"] = {"bundle", "capture", "errors", "evaluation", "plugin", "rasterize", "viewer"}
 """What each part of the package may import of the others."""
 
 ABOVE_THE_METHODS = {"splatart_ns/plugin/fit.py": {"method_configs"}}

@@ -19,6 +19,7 @@ from torch.nn.functional import pad
 from splatart_ns.bundle.assemble import assemble_bundle
 from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.folder import save_bundle
+from splatart_ns.bundle.sliders import freedoms, slider_range, unit_name
 from splatart_ns.capture.capture import Normalization
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import se3_exp, se3_log
@@ -124,7 +125,7 @@ class JointModel(SplatartModel):
             low, high, step = slider_range(*(float(x) * unit for x in (observed.min(), observed.max())))
             slider = ViewerSlider(
                 name=f"{self.part_names[joint.parent]}_to_{self.part_names[joint.child]}{what} "
-                f"({'degree' if turns else 'length' if length_unit == 'unknown' else length_unit})",
+                f"({unit_name(turns, length_unit)})",
                 default_value=float(observed[min(self.state, len(observed) - 1)]) * unit,
                 min_value=low,
                 max_value=high,
@@ -159,16 +160,8 @@ class JointModel(SplatartModel):
 
 
 def _freedoms(tree: KinematicTree) -> list[tuple[Joint, str, bool]]:
-    """A tree's degrees of freedom in the order of a configuration: the joint, what its slider is called besides the
-    joint, and whether the value is an angle."""
-    turns = [(f" turn {axis}", True) for axis in "xyz"]
-    slides = [(f" {axis}", False) for axis in "xyz"]
-    several = {"cylindrical": [(" slide", False), (" turn", True)], "spherical": turns, "free": slides + turns}
-    return [
-        (joint, *freedom)
-        for joint in tree.movable
-        for freedom in several.get(joint.fit.type, [("", joint.fit.type != "prismatic")])
-    ]
+    """A tree's degrees of freedom in the order of a configuration: the joint, and what `freedoms` says of each."""
+    return [(joint, *freedom) for joint in tree.movable for freedom in freedoms(joint.fit.type)]
 
 
 def normal_values(fit: JointFit, normalization: Normalization) -> Tensor:
@@ -177,19 +170,6 @@ def normal_values(fit: JointFit, normalization: Normalization) -> Tensor:
         return se3_log(torch.from_numpy(normalization.motion_to_normal(se3_exp(fit.values).numpy(force=True))))
     lengths = {"prismatic": normalization.scale, "cylindrical": torch.tensor([normalization.scale, 1.0]).to(fit.values)}
     return fit.values * lengths.get(fit.type, 1.0)
-
-
-def slider_range(low: float, high: float) -> tuple[float, float, float]:
-    """Ends and step of a slider for what was observed from `low` to `high`: half as much more on both sides, and a
-    step of 1, 0.1, 0.01, ... that makes hundreds of places."""
-    beyond = max(0.5 * (high - low), 1e-3)
-    decimals = 2 - math.floor(math.log10(high - low + 2 * beyond))
-    step = 10.0**-decimals
-    return (
-        round(math.floor((low - beyond) / step) * step, decimals),
-        round(math.ceil((high + beyond) / step) * step, decimals),
-        step,
-    )
 
 
 @dataclass

@@ -1,0 +1,94 @@
+"""Joint values as people set them: a slider for each degree of freedom, in degrees or the bundle's length unit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle
+from splatart_ns.bundle.configurations import Configuration, movable_joints
+
+_TURNS = tuple((f" turn {axis}", True) for axis in "xyz")
+_SLIDES = tuple((f" {axis}", False) for axis in "xyz")
+_SEVERAL = {
+    "cylindrical": ((" slide", False), (" turn", True)),
+    "spherical": _TURNS,
+    "free": _SLIDES + _TURNS,
+}
+
+
+def freedoms(joint_type: str) -> tuple[tuple[str, bool], ...]:
+    """For each degree of freedom, in the order of a joint's values: what its slider is called besides the joint, and
+    whether the value is an angle."""
+    if JOINT_DOFS[joint_type] == 0:
+        return ()
+    return _SEVERAL.get(joint_type, (("", joint_type != "prismatic"),))
+
+
+def unit_name(turns: bool, length_unit: str) -> str:
+    """What the numbers of a slider are."""
+    return "degree" if turns else "length" if length_unit == "unknown" else length_unit
+
+
+def slider_range(low: float, high: float) -> tuple[float, float, float]:
+    """Ends and step of a slider for what was observed from `low` to `high`: half as much more on both sides, and a
+    step of 1, 0.1, 0.01, ... that makes hundreds of places."""
+    beyond = max(0.5 * (high - low), 1e-3)
+    decimals = 2 - math.floor(math.log10(high - low + 2 * beyond))
+    step = 10.0**-decimals
+    return (
+        round(math.floor((low - beyond) / step) * step, decimals),
+        round(math.ceil((high + beyond) / step) * step, decimals),
+        step,
+    )
+
+
+@dataclass(frozen=True)
+class Slider:
+    """One degree of freedom of a bundle's joint; `low`, `high`, `step` and `observed` are in `unit`."""
+
+    joint: str
+    freedom: int
+    """The place of its number among the joint's values."""
+    label: str
+    unit: str
+    """"degree", or the bundle's length unit, or "length" where that is unknown."""
+    low: float
+    high: float
+    step: float
+    observed: tuple[float, float]
+    """The least and the greatest value over the states, and 0, where state 0 is."""
+
+    @property
+    def units(self) -> float:
+        """What a value of the bundle (radian or length) is multiplied by."""
+        return math.degrees(1) if self.unit == "degree" else 1.0
+
+
+def bundle_sliders(bundle: Bundle) -> list[Slider]:
+    """The sliders of all movable joints of the tree, parents before children."""
+    sliders = []
+    for name, joint in movable_joints(bundle).items():
+        values = joint.values.reshape(len(joint.values), -1).numpy()
+        for index, (suffix, turns) in enumerate(freedoms(joint.type)):
+            unit = unit_name(turns, bundle.length_unit)
+            shown = values[:, index] * (math.degrees(1) if turns else 1.0)
+            observed = float(min(shown.min(), 0.0)), float(max(shown.max(), 0.0))
+            sliders.append(Slider(name, index, f"{name}{suffix} ({unit})", unit, *slider_range(*observed), observed))
+    return sliders
+
+
+def configuration(sliders: Sequence[Slider], positions: Sequence[float]) -> Configuration:
+    """The configuration of the bundle, radians and lengths, at the sliders' positions."""
+    values: dict[str, list[float]] = {}
+    for slider, position in zip(sliders, positions, strict=True):
+        values.setdefault(slider.joint, []).append(position / slider.units)
+    return {name: several if len(several) > 1 else several[0] for name, several in values.items()}
+
+
+def positions(sliders: Sequence[Slider], q: Mapping[str, float | Sequence[float]]) -> list[float]:
+    """The inverse of `configuration`, where joints that `q` does not name are at 0."""
+    return [float(np.ravel(q[s.joint])[s.freedom]) * s.units if s.joint in q else 0.0 for s in sliders]
