@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -23,7 +24,14 @@ def start_splatart() -> Callable[..., subprocess.Popen]:
     def start(*arguments: object) -> subprocess.Popen:
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
         pipe = subprocess.PIPE
-        return subprocess.Popen([*COMMAND, *map(str, arguments)], stdout=pipe, stderr=pipe, text=True, env=environment)
+        return subprocess.Popen(
+            [*COMMAND, *map(str, arguments)],
+            stdout=pipe,
+            stderr=pipe,
+            text=True,
+            env=environment,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells let background jobs ignore it
+        )
 
     return start
 
