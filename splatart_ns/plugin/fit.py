@@ -95,7 +95,11 @@ class Report:
         try:
             earlier = json.loads(self.path.read_text())
             stages = [
-                {**entry, "name": str(entry["name"]), "wall_seconds": entry["wall_seconds"] + 0.0}
+                {
+                    **entry,
+                    "name": str(entry["name"]),
+                    "wall_seconds": entry.get("wall_seconds", entry["seconds"]) + 0.0,  # versions before had no other
+                }
                 for entry in earlier["stages"]
             ]
             had, wanted = earlier["settings"], self.data["settings"]
