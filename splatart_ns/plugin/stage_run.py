@@ -157,7 +157,8 @@ def _serve(source: BinaryIO, tell: Callable[[str, Any], None]) -> None:
 
 
 def _num_cores() -> int:
-    if threads := os.environ.get("OMP_NUM_THREADS"):
+    threads = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]  # "4,2" is for nested regions
+    if threads.isdigit():
         return max(1, int(threads))
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
