@@ -79,7 +79,9 @@ def test_a_run_ends_with_the_process_that_started_it(configs):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="one GPU trains one run at a time")
-@pytest.mark.parametrize(("threads", "runs", "processes"), [("1", 3, 1), ("4", 3, 3), ("4", 8, 4), ("4,2", 8, 4), ("many", 1, 1)])
+@pytest.mark.parametrize(
+    ("threads", "runs", "processes"), [("1", 3, 1), ("4", 3, 3), ("4", 8, 4), ("4,2", 8, 4), ("many", 1, 1)]
+)
 def test_no_more_processes_than_cores_the_user_grants(monkeypatch, threads, runs, processes):
     monkeypatch.setitem(os.environ, "OMP_NUM_THREADS", threads)
     assert num_processes(runs) == processes
