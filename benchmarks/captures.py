@@ -36,7 +36,7 @@ COLUMNS = {
     "slide_mean": "slide\n% R",
     "covered_95": "in\n95 %",
     "psnr": "PSNR\ndB",
-    "seconds": "seconds:\nsemantic + pose + joint",
+    "seconds": "wall seconds:\nsemantic + pose + joint",
 }
 WIDTH = 128
 STAGES = ("semantic", "pose", "joint")
@@ -105,7 +105,7 @@ def figures(truth: dict[str, Any], metrics: dict[str, Any], report: dict[str, An
     joints, radius = metrics["joints"], truth["cameras"]["object_bounding_radius"]
     angles = known(joints, "axis_angle")
     views = [v for name, v in metrics["images"].items() if name.startswith("state")]
-    stages = {s: sum(x["seconds"] for x in report["stages"] if x["name"].startswith(s)) for s in STAGES}
+    stages = {s: sum(x["wall_seconds"] for x in report["stages"] if x["name"].startswith(s)) for s in STAGES}
     return {
         "object": truth["source"]["robot_name"],
         "parts": len(truth["parts"]),
