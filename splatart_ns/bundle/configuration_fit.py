@@ -14,7 +14,8 @@ from splatart_ns.bundle.posing import configured_motions, joint_motion, normaliz
 from splatart_ns.capture.capture import Normalization
 from splatart_ns.capture.view import View
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.part_pair import HUBER, PartView, best_views, huber, part_view
+from splatart_ns.stages.part_pair import PartView, best_views, huber, part_view
+from splatart_ns.stages.refinement import linearized
 
 _COARSE, _FINE = (5, 1500), (12, 10000)
 """Views of a part, and the number of its pixels in each, in the search and in the refinement."""
@@ -140,17 +141,14 @@ def _refine(
         H, g, cost = torch.zeros(D, D, dtype=x.dtype), torch.zeros(D, dtype=x.dtype), 0.0
         motions = motions_at(x + steps)
         for name, splat in splats.items():
-            moving = [0] + [k + 1 for k in range(D) if not torch.equal(motions[name][k + 1], motions[name][0])]
+            moves = torch.tensor([not torch.equal(T, motions[name][0]) for T in motions[name][1:]])
+            k = moves.nonzero()[:, 0]
+            tried = motions[name][torch.cat([k.new_zeros(1), k + 1])]
             for look in looks[name]:
-                difference = look.difference(splat, motions[name][moving])
-                r = difference[0].reshape(-1)
-                J = torch.zeros(D, len(r), dtype=r.dtype)
-                J[[k - 1 for k in moving[1:]]] = (difference[1:].reshape(len(moving) - 1, -1) - r) / _STEP
-                w = look.weight[..., None].expand(difference.shape[1:]).reshape(-1)
-                wJ = J * (w * (HUBER / r.abs().clamp_min(1e-12)).clamp_max(1.0))
-                H += (wJ @ J.T).double()
-                g += (wJ @ r).double()
-                cost += float((w * huber(r)).sum())
+                part_H, part_g, part_cost = linearized(look.difference(splat, tried), look.weight, _STEP)
+                H[k[:, None], k] += part_H
+                g[k] += part_g
+                cost += part_cost
         return H, g, cost
 
     H, g, cost = equations(x)

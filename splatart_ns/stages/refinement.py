@@ -74,22 +74,27 @@ class NormalEquations:
     cost: float
 
 
+def linearized(difference: Tensor, weight: Tensor, step: float) -> tuple[Tensor, Tensor, float]:
+    """Gauss-Newton's H [n, n] and g [n] of the Huber cost of one view, float64, and that cost.
+
+    Args:
+        difference: What differs [1 + n, H, W, C]: at the point, and after a step along each parameter.
+        weight: Of the pixels [H, W].
+        step: Length of the steps, in the parameters' units.
+    """
+    r = difference[0].reshape(-1)
+    J = (difference[1:].reshape(len(difference) - 1, -1) - r) / step
+    w = weight[..., None].expand(difference.shape[1:]).reshape(-1)
+    wJ = J * (w * (HUBER / r.abs().clamp_min(1e-12)).clamp_max(1.0))
+    return (wJ @ J.T).double(), (wJ @ r).double(), float((w * huber(r)).sum())
+
+
 @torch.no_grad()
 def _normal_equations(pair: PartPair, T: Tensor, n: int) -> NormalEquations:
     steps = torch.nn.functional.pad(STEP * torch.eye(n, dtype=T.dtype, device=T.device), (0, 6 - n, 1, 0))
     motions = increment(T.expand(n + 1, 4, 4), steps, pair.centroid, pair.radius)
-    H = torch.zeros(n, n, dtype=T.dtype, device=T.device)
-    gradients = []
-    cost = 0.0
-    for difference, weight in pair.residuals(motions):
-        r = difference[0].reshape(-1)
-        J = (difference[1:].reshape(n, -1) - r) / STEP
-        w = weight[..., None].expand(difference.shape[1:]).reshape(-1)
-        wJ = J * (w * (HUBER / r.abs().clamp_min(1e-12)).clamp_max(1.0))
-        H += (wJ @ J.T).double()
-        gradients.append((wJ @ r).double())
-        cost += float((w * huber(r)).sum())
-    return NormalEquations(H, torch.stack(gradients), cost / max(pair.area, 1.0))
+    H, gradients, costs = zip(*(linearized(d, w, STEP) for d, w in pair.residuals(motions)), strict=True)
+    return NormalEquations(sum(H), torch.stack(gradients), sum(costs) / max(pair.area, 1.0))
 
 
 def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | None = None) -> Tensor:

@@ -9,10 +9,11 @@ import sys
 
 import pytest
 import torch
+from rich.progress import Progress
 
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.errors import InputError
-from splatart_ns.plugin.fit import Settings, _semantic_config
+from splatart_ns.plugin.fit import Report, Settings, _semantic_config, _train
 from splatart_ns.plugin.stage_run import num_processes, run_side_by_side
 
 
@@ -34,6 +35,21 @@ def test_outcomes_come_in_order_and_every_run_is_saved(configs):
     assert all(outcome["gaussians"] > 0 and outcome["seconds"] > 0 for outcome in outcomes)
     assert all(done == sorted(done) and done[-1] == 4 for done in steps.values())
     assert all(list(config.get_base_dir().glob("nerfstudio_models/step-*.ckpt")) for config in configs)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="one GPU trains one run at a time")
+def test_a_fit_reports_states_side_by_side_in_order_and_takes_them_up_again(configs, monkeypatch, tmp_path):
+    monkeypatch.setitem(os.environ, "OMP_NUM_THREADS", "2")
+    capture = load_capture(tmp_path / "capture")
+    stages = dict(zip(("semantic a", "semantic b"), configs, strict=True))
+    for seen in ([], [4, 4]):
+        report, progress = Report(tmp_path / "report.json", capture, Settings("draft", None, 0)), Progress()
+        assert [entry["iterations"] for entry in report._earlier] == seen
+        _train(stages, "auto", report, progress)
+        assert all(task.finished for task in progress.tasks)
+    told = json.loads((tmp_path / "report.json").read_text())
+    assert [stage["name"] for stage in told["stages"]] == list(stages)
+    assert told["seconds"] == pytest.approx(sum(stage["wall_seconds"] for stage in told["stages"]), abs=0.02)
 
 
 def test_one_process_after_the_other_leaves_the_same(configs, tmp_path):

@@ -1,8 +1,10 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from part_scene import motion, two_states
 
-from splatart_ns.stages.part_pair import best_views, part_pair, part_view
+from splatart_ns.stages.part_pair import CHROMA_WEIGHT, best_views, part_pair, part_view
 
 EYE = torch.eye(4, dtype=torch.float64)
 
@@ -84,3 +86,18 @@ def test_a_part_that_a_state_lacks_makes_no_pair(scene):
     splats, views = scene
     without = splats[1].select(splats[1].part_ids != 2)
     assert part_pair((splats[0], without), views, 2, num_views=3, pixels=500) is None
+
+
+def test_a_change_of_hue_counts_for_more_than_one_of_brightness(scene):
+    """Where hues are asked for; otherwise both count alike."""
+    piece, empty = part_view(scene[1][0][0], 2), scene[0][0].select(torch.zeros(len(scene[0][0]), dtype=torch.bool))
+    shift = 0.1 * piece.rgba[..., 3:]
+
+    def change(rgb, **weight):
+        changed = replace(piece, rgba=piece.rgba + torch.cat([shift * torch.tensor(rgb), 0 * shift], dim=-1))
+        return (changed.difference(empty, EYE[None], **weight) - piece.difference(empty, EYE[None], **weight)).norm()
+
+    brighter, redder = (1.0, 1.0, 1.0), (2**0.5, -(2**-0.5), -(2**-0.5))
+    assert change(redder) == pytest.approx(float(change(brighter)), rel=1e-3)
+    assert change(redder, chroma_weight=CHROMA_WEIGHT) > 6 * change(brighter, chroma_weight=CHROMA_WEIGHT)
+    assert change(brighter, chroma_weight=CHROMA_WEIGHT) == pytest.approx(float(change(brighter)), rel=1e-3)

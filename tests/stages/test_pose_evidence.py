@@ -1,8 +1,11 @@
 import torch
 from part_scene import angle_deg, motion, nearby, two_states
 
+from splatart_ns.stages import pose_evidence
 from splatart_ns.stages.joint import PRISMATIC_BELOW
+from splatart_ns.stages.part_pair import CHROMA_WEIGHT
 from splatart_ns.stages.pose_evidence import refine_poses, rotation_held_ratios
+from splatart_ns.stages.refinement import refine
 
 
 def poses_of(T):
@@ -35,3 +38,17 @@ def test_poses_are_refined_but_for_frozen_ones_and_covariances_are_proper():
     assert covariance.shape == (2, 2, 6, 6)
     assert (covariance[0] == 0).all()
     assert (torch.linalg.eigvalsh(covariance[1]) > -1e-12).all()
+
+
+def test_the_last_refinement_looks_at_hues(monkeypatch):
+    """What it gains was measured on fits (README); a scene as small as this one is held by its silhouettes."""
+    weights = []
+
+    def watched(pair, *args):
+        weights.append(pair.chroma_weight)
+        return refine(pair, *args)
+
+    monkeypatch.setattr(pose_evidence, "refine", watched)
+    truth = motion((0, 0, 20), (0.1, 0.0, 0.0))
+    refine_poses(*two_states(truth), poses_of(truth), torch.tensor([[True, True], [True, False]]))
+    assert weights == [CHROMA_WEIGHT]
