@@ -11,16 +11,14 @@ from torch import Tensor
 
 from splatart_ns.bundle.animation import bundle_colours
 from splatart_ns.bundle.bundle import Bundle, Joint
+from splatart_ns.bundle.joint_axis import axis_deviation, axis_line
 from splatart_ns.capture.capture import Normalization
 from splatart_ns.geometry.se3 import quat_from_matrix
 
 _RADIUS = 0.008
 """Of the rod, in radii of the object."""
-_MARGIN = 0.2
-"""How far the rod sticks out of the child at both ends, in radii of the object."""
 _SECTIONS = 24
 _OPACITY = 0.6
-_WITH_LINE = ("revolute", "prismatic", "screw", "cylindrical")
 
 
 def joint_mesh(joint: Joint, points: np.ndarray, radius: float) -> trimesh.Trimesh | None:
@@ -32,39 +30,21 @@ def joint_mesh(joint: Joint, points: np.ndarray, radius: float) -> trimesh.Trime
     if joint.type == "spherical":
         ball = trimesh.creation.icosphere(subdivisions=3, radius=3 * _RADIUS * radius)
         return ball.apply_translation(joint.origin.numpy())
-    if joint.type not in _WITH_LINE:
+    line = axis_line(joint, points, radius)
+    if line is None:
         return None
-    axis, origin = joint.axis.numpy(), joint.origin.numpy()
-    if len(points) == 0:
-        points = origin[None]
-    if joint.type == "prismatic":  # its axis has a direction only, so it is drawn through the child
-        origin = np.median(points, axis=0)
-    low, high = np.quantile((points - origin) @ axis, [0.02, 0.98]) + _MARGIN * radius * np.array([-1, 1])
-    along = np.linspace(low, high, _SECTIONS)
+    along = np.linspace(line.low, line.high, _SECTIONS)
     around = _RADIUS * radius + 2 * axis_deviation(joint, along)
     tip = 4 * _RADIUS * radius
     profile = [
-        (0.0, low),
+        (0.0, line.low),
         *zip(around, along, strict=True),
-        (around[-1] + tip / 2, high),
-        (0.0, high + 2 * tip),
+        (around[-1] + tip / 2, line.high),
+        (0.0, line.high + 2 * tip),
     ]
     arrow = trimesh.creation.revolve(np.array(profile), sections=16)
-    arrow.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], axis))
-    return arrow.apply_translation(origin)
-
-
-def axis_deviation(joint: Joint, along: np.ndarray) -> np.ndarray:
-    """Standard deviation [K], length, of the axis at the places `origin + along * axis`, in the worst direction.
-
-    The covariance of such a place is C_oo + s (C_ao + C_ao^T) + s^2 C_aa. Blocks that the bundle lacks count as 0.
-    """
-    aa, oo, ao = (
-        np.zeros((3, 3)) if (block := joint.covariance.get(name)) is None else np.array(block)
-        for name in ("axis", "origin", "axis_origin")
-    )
-    s = along[:, None, None]
-    return np.sqrt(np.linalg.eigvalsh(oo + s * (ao + ao.T) + s**2 * aa)[:, -1].clip(0))
+    arrow.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], line.axis))
+    return arrow.apply_translation(line.origin)
 
 
 class Axes:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import re
 
-import numpy as np
 import viser
 
 from splatart_ns.bundle.bundle import Bundle, Joint
 from splatart_ns.bundle.configurations import Configuration
+from splatart_ns.bundle.joint_axis import direction_deviation
 from splatart_ns.bundle.sliders import bundle_sliders, configuration, positions
 
 _LINE = 36
@@ -97,11 +97,8 @@ def tree_text(bundle: Bundle) -> str:
 def describe_joint(joint: Joint) -> str:
     """Type, parent, and how certain the axis is."""
     text = f"{joint.type} on {joint.parent}"
-    block = joint.covariance.get("axis")
-    if block is None:
-        return text
-    deviation = math.sqrt(max(np.linalg.eigvalsh(np.array(block))[-1], 0.0))
-    return f"{text}, axis ± {math.degrees(deviation):.2g} degree"
+    deviation = direction_deviation(joint)
+    return text if deviation is None else f"{text}, axis ± {math.degrees(deviation):.2g} degree"
 
 
 def _breakable(label: str) -> str:

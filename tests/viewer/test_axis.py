@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from splatart_ns.viewer.axis import axis_deviation, joint_mesh
+from splatart_ns.bundle.joint_axis import axis_deviation
+from splatart_ns.viewer.axis import joint_mesh
 
 POINTS = np.array([[0.0, -0.5, 0.7], [0, 0.5, 0.7], [0.5, 0, 0.7]])
 

@@ -1,0 +1,21 @@
+"use strict";
+// Making what a page is made of. Names come from strangers, so texts are only ever set as texts.
+
+/** An element with properties and children; children that are strings become text. */
+function element(tag, properties = {}, ...children) {
+    const made = Object.assign(document.createElement(tag), properties);
+    made.append(...children);
+    return made;
+}
+
+/** A square in a part's colour. */
+function swatch(part) {
+    const made = element("span", {className: "swatch"});
+    made.style.background = cssColour(part.colour);
+    return made;
+}
+
+/** A number for a person, with so many digits that count. */
+function digits(x, count = 3) {
+    return x === 0 ? "0" : String(Number(x.toPrecision(count))).replace("-", "−");
+}

@@ -1,0 +1,62 @@
+"use strict";
+// The order of the Gaussians from far to near, found by counting in a thread of its own.
+
+/** Runs in the worker: nothing outside it exists there. */
+function sortingWorker() {
+    const KEYS = 65536;
+    let centres, parts, depths, keys;
+
+    /** The Gaussians of the shown parts, farthest first. `rows` holds, for each part, four numbers that make a depth. */
+    function sort(rows, shown) {
+        let near = Infinity, far = -Infinity, count = 0;
+        for (let i = 0; i < parts.length; i++) {
+            if (!shown[parts[i]]) continue;
+            const r = 4 * parts[i], c = 3 * i;
+            const depth = rows[r] * centres[c] + rows[r + 1] * centres[c + 1] + rows[r + 2] * centres[c + 2] + rows[r + 3];
+            depths[i] = depth;
+            near = Math.min(near, depth);
+            far = Math.max(far, depth);
+            count++;
+        }
+        const scale = far > near ? (KEYS - 1) / (far - near) : 0;
+        const places = new Uint32Array(KEYS + 1);
+        for (let i = 0; i < parts.length; i++) {
+            if (!shown[parts[i]]) continue;
+            keys[i] = (far - depths[i]) * scale;
+            places[keys[i] + 1]++;
+        }
+        for (let key = 1; key < KEYS; key++) places[key] += places[key - 1];
+        const order = new Uint32Array(count);
+        for (let i = 0; i < parts.length; i++) {
+            if (shown[parts[i]]) order[places[keys[i]]++] = i;
+        }
+        return order;
+    }
+
+    onmessage = ({data}) => {
+        if (data.centres) {
+            ({centres, parts} = data);
+            depths = new Float32Array(parts.length);
+            keys = new Uint16Array(parts.length);
+        } else {
+            const order = sort(data.rows, data.shown);
+            postMessage(order, [order.buffer]);
+        }
+    };
+}
+
+class Sorter {
+    constructor(gaussians) {
+        const address = URL.createObjectURL(new Blob([`(${sortingWorker})()`], {type: "text/javascript"}));
+        this.worker = new Worker(address);
+        this.worker.postMessage({centres: gaussians.centres, parts: gaussians.parts});
+        this.waiting = [];  // the worker answers in turn
+        this.worker.onmessage = ({data}) => this.waiting.shift()(data);
+    }
+
+    /** A promise of the indices of the Gaussians to be drawn. */
+    sort(rows, shown) {
+        this.worker.postMessage({rows, shown});
+        return new Promise(resolve => this.waiting.push(resolve));
+    }
+}
