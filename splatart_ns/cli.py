@@ -178,7 +178,7 @@ def evaluate(bundle: Annotated[Path, tyro.conf.Positional], data: Path, rasteriz
 
 def export(
     bundle: Annotated[Path, tyro.conf.Positional],
-    format: tuple[Literal["urdf", "mjcf", "usd", "glb", "ply"], ...],
+    format: tuple[Literal["urdf", "mjcf", "usd", "glb", "ply", "html"], ...],
     output: Path | None = None,
     scale: float | None = None,
     density: float = 400.0,
@@ -189,7 +189,8 @@ def export(
 
     Args:
         bundle: Folder that `splatart fit` left.
-        format: One or more: urdf, mjcf (MuJoCo), usd (UsdPhysics), glb (a node a part, animated), ply (all Gaussians).
+        format: One or more: urdf, mjcf (MuJoCo), usd (UsdPhysics), glb (a node a part, animated), ply (all Gaussians),
+            html (a page with a slider for each joint, in one file).
         output: Folder of the export; with several formats each has its folder in it. By default BUNDLE/export/FORMAT.
         scale: Metres per unit of the bundle; by default what its unit says, or 1 where it is unknown.
         density: Of the parts, filled, in kg / m^3.
@@ -206,7 +207,7 @@ def export(
         raise InputError(f"--limit-margin is {limit_margin}; give a number of 0 or more.")
     formats = tuple(dict.fromkeys(format))
     if not formats:
-        raise InputError("--format is empty; give one or more of urdf, mjcf, usd, glb, ply.")
+        raise InputError("--format is empty; give one or more of urdf, mjcf, usd, glb, ply, html.")
     # What cannot be written is said before the meshes are made.
     exports.require(formats)
     folders = {form: bundle / "export" / form if output is None else output for form in formats}
@@ -216,9 +217,9 @@ def export(
         exports.check_folder(folder)
     loaded = load_bundle(bundle)
     with CONSOLE.status(f"Meshes of {len(loaded.parts)} parts ..."):
-        shapes = exports.part_shapes(loaded) if formats != ("ply",) else None
+        shapes = exports.part_shapes(loaded) if set(formats) - exports.WITHOUT_MESHES else None
     robot = exports.describe(loaded, shapes, bundle.resolve().name, scale, density, limit_margin)
-    for note in robot.notes:
+    for note in robot.notes if set(formats) - {"html"} else ():  # a page has the bundle's own names, units and joints
         CONSOLE.print(f"note: {note}", markup=False)
     failed = False
     for form, folder in folders.items():

@@ -19,7 +19,7 @@ DRAW = """
     const before = page.values;
     page.values = values;
     const started = performance.now();
-    page.draw(camera ?? page.camera.at(page.canvas.width, page.canvas.height), 1).then(() => {
+    page.draw(camera ?? page.camera.at(page.canvas.width, page.canvas.height)).then(() => {
         const bytes = page.renderer.pixels(), seconds = (performance.now() - started) / 1000;  // reading waits for it
         page.values = before;
         let text = "";

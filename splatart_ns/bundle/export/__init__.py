@@ -2,7 +2,7 @@
 
 from splatart_ns.bundle.export.describe import DENSITY, LIMIT_MARGIN, describe
 from splatart_ns.bundle.export.folder import check_folder
-from splatart_ns.bundle.export.formats import Format, export, format_notes, require
+from splatart_ns.bundle.export.formats import WITHOUT_MESHES, Format, export, format_notes, require
 from splatart_ns.bundle.export.robot import Robot
 from splatart_ns.bundle.export.shapes import PartShape, part_shapes
 from splatart_ns.bundle.export.validation import Check, format_checks, validate
@@ -10,6 +10,7 @@ from splatart_ns.bundle.export.validation import Check, format_checks, validate
 __all__ = [
     "DENSITY",
     "LIMIT_MARGIN",
+    "WITHOUT_MESHES",
     "Check",
     "Format",
     "PartShape",

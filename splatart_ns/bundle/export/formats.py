@@ -11,13 +11,16 @@ from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.export.folder import export_folder
 from splatart_ns.bundle.export.glb import write_glb
 from splatart_ns.bundle.export.mjcf import write_mjcf
+from splatart_ns.bundle.export.page import write_page
 from splatart_ns.bundle.export.ply import write_whole_ply
 from splatart_ns.bundle.export.robot import Robot
 from splatart_ns.bundle.export.urdf import write_urdf
 from splatart_ns.bundle.export.usd import write_usd
 from splatart_ns.errors import InputError
 
-Format = Literal["urdf", "mjcf", "usd", "glb", "ply"]
+Format = Literal["urdf", "mjcf", "usd", "glb", "ply", "html"]
+WITHOUT_MESHES: frozenset[Format] = frozenset({"ply", "html"})
+"""Formats of the Gaussians themselves."""
 
 
 def export(bundle: Bundle, robot: Robot, form: Format, folder: Path) -> Path:
@@ -32,6 +35,8 @@ def export(bundle: Bundle, robot: Robot, form: Format, folder: Path) -> Path:
     with export_folder(folder, _about(robot, form)) as fresh:
         if form == "ply":
             path = write_whole_ply(bundle, robot.name, robot.scale, fresh)
+        elif form == "html":
+            path = write_page(bundle, robot.name, fresh)
         else:
             writers = {"urdf": write_urdf, "mjcf": write_mjcf, "usd": write_usd, "glb": write_glb}
             path = writers[form](robot, fresh)
@@ -62,6 +67,8 @@ def format_notes(robot: Robot, form: Format) -> list[str]:
 
 
 def _about(robot: Robot, form: Format) -> Mapping:
+    if form == "html":  # has the bundle's own names and units
+        return {"of": form}
     return {
         "of": form,
         "metres_per_unit": robot.scale,

@@ -36,7 +36,7 @@ from splatart_ns.bundle.viewpoint import bounding_sphere, front_azimuth
 FORMAT = "splatart-page-1"
 _SCRIPTS = (
     *("elements.js", "motion.js", "gaussians.js", "sorter.js", "renderer.js", "camera.js", "axes.js", "sweep.js"),
-    *("panel.js", "table.js", "page.js"),
+    *("panel.js", "table.js", "pace.js", "page.js"),
 )
 """In the order in which they need each other; the last starts the page."""
 _SMALLEST = math.log(1e-4)

@@ -28,19 +28,25 @@ from splatart_ns.bundle.export.consumers import (
 from splatart_ns.bundle.export.describe import expected_poses
 from splatart_ns.bundle.export.formats import Format
 from splatart_ns.bundle.export.glb import sweep
+from splatart_ns.bundle.export.page_model import PageModel
 from splatart_ns.bundle.export.robot import Robot
 from splatart_ns.bundle.export.simulation import simulate
+from splatart_ns.bundle.posing import configured_motions
+from splatart_ns.bundle.sliders import bundle_sliders, configuration
 
 CONFIGURATIONS = 100
 POSE_ERROR = 1e-6
 """The most that a link's pose may differ: rotation matrices as they are, positions in the robot's sizes."""
 _EXCESS, _REACHED = 0.01, 0.9
+_PACKED_ERROR = 1e-3
+"""The most that a Gaussian in a page may be off, in radii of the object."""
 _CONSUMERS = {
     "urdf": (("yourdfpy", YourdfpyModel), ("mujoco", MujocoModel), ("pybullet", PybulletModel)),
     "mjcf": (("mujoco", MujocoModel),),
     "usd": (("usd-core", UsdModel),),
     "glb": (("trimesh", GlbModel),),
     "ply": (),
+    "html": (),
 }
 """By format, the packages that read it."""
 
@@ -59,6 +65,8 @@ def validate(path: Path, form: Format, bundle: Bundle, robot: Robot) -> list[Che
     """Open an export in every program at hand and compare it with the bundle."""
     if form == "ply":
         return _guarded("trimesh", "Gaussians", lambda: _check_ply(path, bundle, robot))
+    if form == "html":
+        return _guarded("splatart", "page", lambda: _check_page(path, bundle))
     wanted = [(values, expected_poses(bundle, robot, values)) for values in random_values(robot, CONFIGURATIONS)]
     checks = []
     for program, model in _CONSUMERS[form]:
@@ -109,12 +117,11 @@ def random_values(robot: Robot, count: int, seed: int = 0) -> list[dict[str, flo
 def _check_poses(program: str, model: Any, wanted: list[tuple[dict, dict]], robot: Robot) -> Check:
     """`wanted` are values of the freedoms and the poses expected there."""
     pairs = [(model.poses(values), expected) for values, expected in wanted]
-    return _poses_check(program, "link poses", pairs, robot)
+    return _poses_check(program, "link poses", pairs, robot.size)
 
 
-def _poses_check(program: str, what: str, pairs: list[tuple[dict, dict]], robot: Robot) -> Check:
-    """Compares (found, expected) poses; NaN fails."""
-    size = robot.size
+def _poses_check(program: str, what: str, pairs: list[tuple[dict, dict]], size: float) -> Check:
+    """Compares (found, expected) poses, positions in sizes of the object; NaN fails."""
     worst, where = -1.0, ""
     for found, expected in pairs:
         for name in expected:
@@ -156,7 +163,7 @@ def _check_animation(path: Path, bundle: Bundle, robot: Robot) -> list[Check]:
     for t in np.random.default_rng(0).uniform(0, times[-1], CONFIGURATIONS):
         q = {name: np.interp(t, times, [values[name] for values in configurations]) for name in configurations[0]}
         pairs.append((animation.poses(t), expected_poses(bundle, robot, q)))
-    return [_poses_check("trimesh", "animation", pairs, robot)]
+    return [_poses_check("trimesh", "animation", pairs, robot.size)]
 
 
 def _check_ply(path: Path, bundle: Bundle, robot: Robot) -> list[Check]:
@@ -172,6 +179,24 @@ def _check_ply(path: Path, bundle: Bundle, robot: Robot) -> list[Check]:
     verdict = "passed" if error <= POSE_ERROR else "failed"
     what = f"{len(found)} of {len(ids)}, in {len(bundle.parts)} parts; error {error:.0e} at most"
     return [Check("trimesh", "Gaussians", verdict, what)]
+
+
+def _check_page(path: Path, bundle: Bundle) -> list[Check]:
+    """Its data, read again; what it does with them is only known to a browser."""
+    page, rng, sliders = PageModel(path), np.random.default_rng(0), bundle_sliders(bundle)
+    counts = {part.name: len(part.splat) for part in bundle.parts}
+    found = {part["name"]: part["count"] for part in page.object["parts"]}
+    error = np.inf
+    if found == counts:
+        differences = [page.column(i, "means") - part.splat.means.numpy() for i, part in enumerate(bundle.parts)]
+        error = np.abs(np.concatenate(differences)).max(initial=0.0) / page.radius
+    what = f"{sum(found.values())} of {sum(counts.values())}, in {len(counts)} parts; error {error:.0e} at most"
+    checks = [Check("splatart", "Gaussians", "passed" if error <= _PACKED_ERROR else "failed", what)]
+    pairs = []
+    for _ in range(CONFIGURATIONS):
+        q = configuration(sliders, [rng.uniform(slider.low, slider.high) for slider in sliders])
+        pairs.append((page.motions(q), {name: T.numpy() for name, T in configured_motions(bundle, q).items()}))
+    return [*checks, _poses_check("splatart", "part poses", pairs, page.radius)]
 
 
 def _self_collision(robot: Robot) -> Check:

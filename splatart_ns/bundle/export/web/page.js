@@ -2,6 +2,7 @@
 // The page: what the controls say is what the picture shows.
 
 const MAX_PIXEL_RATIO = 2;
+const REST_MILLISECONDS = 200;
 
 class Page {
     constructor(object) {
@@ -11,7 +12,8 @@ class Page {
         this.inPartColours = false;
         this.withAxes = true;
         this.sweep = null;
-        this.isDue = this.isDrawing = false;
+        this.isDue = this.isDrawing = this.isWarm = false;
+        this.pace = new Pace();
         this.canvas = get("picture");
         this.camera = new OrbitCamera(object.view);
         document.title = object.title;
@@ -28,30 +30,44 @@ class Page {
         new ResizeObserver(() => this.changed()).observe(get("scene"));
     }
 
-    /** Ask for a picture; one shows all that has changed until it is drawn. */
+    /** Ask for a picture; one shows all that has changed until it is drawn, and one at rest follows when nothing does. */
     async changed() {
         this.isDue = true;
-        if (this.isDrawing) return;
+        if (this.isDrawing || !this.renderer) return;
         this.isDrawing = true;
+        clearTimeout(this.rest);
         while (this.isDue) {
             await new Promise(requestAnimationFrame);
             this.isDue = false;
             if (this.sweep) this.advance();
-            const scene = get("scene"), ratio = Math.min(window.devicePixelRatio, MAX_PIXEL_RATIO);
-            const [width, height] = [scene.clientWidth, scene.clientHeight].map(x => Math.max(1, Math.round(ratio * x)));
-            await this.draw(this.camera.at(width, height), ratio);
+            const scale = this.pace.scale, started = performance.now();
+            await this.drawScene(scale);
+            await this.renderer.finished();
+            if (this.isWarm) this.pace.learn(scale, (performance.now() - started) / 1000);
+            this.isWarm = true;  // the first picture takes longer
         }
         this.isDrawing = false;
+        if (this.pace.scale < 1) this.rest = setTimeout(() => this.drawScene(1), REST_MILLISECONDS);
     }
 
-    async draw(camera, pixelRatio) {
+    /** Draw on as many pixels as the screen has, times `scale`; axes always on all. */
+    async drawScene(scale) {
+        const scene = get("scene"), ratio = Math.min(window.devicePixelRatio, MAX_PIXEL_RATIO);
+        const camera = by => this.camera.at(
+            Math.max(1, Math.round(by * scene.clientWidth)), Math.max(1, Math.round(by * scene.clientHeight)));
+        const motions = await this.draw(camera(scale * ratio));
+        get("overlay").hidden = !this.withAxes;
+        if (this.withAxes) drawAxes(get("overlay"), this.object, motions, camera(ratio), ratio);
+    }
+
+    /** Draw what a camera sees (see `OrbitCamera.at`); returns where the parts are. */
+    async draw(camera) {
         const motions = partMotions(this.object, this.values);
         const T_camera_part = motions.map(T => multiply(camera.T_camera_world, T));
         const rows = Float32Array.from(T_camera_part.flatMap(T => T.slice(8, 12)));
-        const order = await this.sorter.sort(rows, this.shown);
-        this.renderer.draw(order, T_camera_part, camera, this.inPartColours);
-        get("overlay").hidden = !this.withAxes;
-        if (this.withAxes) drawAxes(get("overlay"), this.object, motions, camera, pixelRatio);
+        const vertices = await this.sorter.sort(rows, this.shown);
+        this.renderer.draw(vertices, T_camera_part, camera, this.inPartColours);
+        return motions;
     }
 
     advance() {

@@ -22,17 +22,13 @@ class Renderer {
         this.partData = new Float32Array(4 * PART_TEXELS * colours.length);
         this.addTexture("parts", 2, PART_TEXELS, this.partData);
 
-        this.orders = gl.createBuffer();
-        gl.bindBuffer(gl.ARRAY_BUFFER, this.orders);
-        gl.enableVertexAttribArray(0);
-        gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-        gl.vertexAttribDivisor(0, 1);
+        gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
         gl.enable(gl.BLEND);
         gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     }
 
-    /** Draw the Gaussians `order`, at T_camera_part of each part, seen by a camera (see `OrbitCamera.at`). */
-    draw(order, T_camera_part, camera, inPartColours) {
+    /** Draw the triangles of a `Sorter`, at T_camera_part of each part, seen by a camera (see `OrbitCamera.at`). */
+    draw(vertices, T_camera_part, camera, inPartColours) {
         const gl = this.gl, {width, height} = camera;
         T_camera_part.forEach((T, i) => {
             const eye = [0, 1, 2].map(k => -(T[k] * T[3] + T[4 + k] * T[7] + T[8 + k] * T[11]));
@@ -40,7 +36,7 @@ class Renderer {
         });
         gl.activeTexture(gl.TEXTURE2);
         gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, PART_TEXELS, this.colours.length, gl.RGBA, gl.FLOAT, this.partData);
-        gl.bufferData(gl.ARRAY_BUFFER, order, gl.STREAM_DRAW);
+        gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, vertices, gl.STREAM_DRAW);
         if (this.canvas.width !== width) this.canvas.width = width;
         if (this.canvas.height !== height) this.canvas.height = height;
         gl.viewport(0, 0, width, height);
@@ -51,7 +47,16 @@ class Renderer {
         gl.uniform1i(this.uniforms.inPartColours, inPartColours ? 1 : 0);
         gl.clearColor(0, 0, 0, 0);
         gl.clear(gl.COLOR_BUFFER_BIT);
-        gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, order.length);
+        gl.drawElements(gl.TRIANGLES, vertices.length, gl.UNSIGNED_INT, 0);
+    }
+
+    /** A promise that what was drawn is done. */
+    async finished() {
+        const gl = this.gl, sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+        gl.flush();
+        while (!gl.isContextLost() && gl.getSyncParameter(sync, gl.SYNC_STATUS) === gl.UNSIGNALED)
+            await new Promise(resolve => setTimeout(resolve, 1));
+        gl.deleteSync(sync);
     }
 
     /** The picture that was just drawn, over black: RGBA bytes from the bottom row up. */

@@ -16,16 +16,17 @@ uniform vec2 size, focal, principal;  // pixel
 uniform float near;
 uniform bool inPartColours;
 
-layout(location = 0) in uint index;
 out vec2 place;  // in standard deviations
 flat out vec4 colour;
+
+int gaussian;
 
 vec4 texel(sampler2D from, int n) {
     return texelFetch(from, ivec2(n & ((1 << WIDTH_BITS) - 1), n >> WIDTH_BITS), 0);
 }
 
 vec3 coefficient(int k) {
-    return texel(harmonics, int(index) * coefficients + k).rgb;
+    return texel(harmonics, gaussian * coefficients + k).rgb;
 }
 
 // Order and signs as in splatart_ns/geometry/spherical_harmonics.py.
@@ -52,16 +53,17 @@ vec3 shColour(vec3 d) {
 }
 
 void main() {
+    gaussian = gl_VertexID >> 2;
     gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside, unless it is seen
-    vec4 first = texel(geometry, 4 * int(index));
+    vec4 first = texel(geometry, 4 * gaussian);
     vec3 mean = first.xyz;
     int part = int(first.w);
     // T_camera_part, OpenCV axes, and the camera's place in the part's frame.
     vec4 row0 = texelFetch(parts, ivec2(0, part), 0), row1 = texelFetch(parts, ivec2(1, part), 0),
          row2 = texelFetch(parts, ivec2(2, part), 0), eye = texelFetch(parts, ivec2(3, part), 0),
          partColour = texelFetch(parts, ivec2(4, part), 0);
-    vec4 axis0 = texel(geometry, 4 * int(index) + 1), axis1 = texel(geometry, 4 * int(index) + 2),
-         axis2 = texel(geometry, 4 * int(index) + 3);
+    vec4 axis0 = texel(geometry, 4 * gaussian + 1), axis1 = texel(geometry, 4 * gaussian + 2),
+         axis2 = texel(geometry, 4 * gaussian + 3);
     float opacity = axis0.w, brightness = axis1.w;
 
     vec3 local = vec3(dot(row0, vec4(mean, 1.0)), dot(row1, vec4(mean, 1.0)), dot(row2, vec4(mean, 1.0)));
@@ -83,7 +85,7 @@ void main() {
 
     // The ellipse ends where alpha falls below what is drawn.
     float reach = sqrt(2.0 * log(opacity / LEAST_ALPHA));
-    vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+    vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
     place = reach * corner;
     vec2 pixel = centre + place.x * sqrt(large) * along + place.y * sqrt(small) * vec2(-along.y, along.x);
     gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
