@@ -40,6 +40,14 @@ def test_several_formats_get_a_folder_each(run_main, folder, tmp_path):
     assert json.loads((tmp_path / "out" / "glb" / "export.json").read_text())["metres_per_unit"] == 0.1
 
 
+def test_a_page_needs_no_meshes_and_has_the_bundles_own_units(run_main, folder, monkeypatch):
+    monkeypatch.delattr(exports, "part_shapes")
+    code, output, errors = run_main("export", folder, "--format", "html")
+    assert (code, errors) == (0, "") and "note" not in output
+    assert (folder / "export" / "html" / "my_box.html").is_file()
+    assert re.search(r"splatart Gaussians passed 18 of 18, in 3 parts", plain(output))
+
+
 def test_one_format_goes_where_it_is_told_and_may_go_there_again(run_main, folder, tmp_path):
     for _ in range(2):
         code, _, errors = run_main("export", folder, "--format", "glb", "--output", tmp_path / "out")

@@ -8,6 +8,11 @@ function element(tag, properties = {}, ...children) {
     return made;
 }
 
+/** With places to break the line, of which a long name has none that browsers know. */
+function breakable(name) {
+    return name.replace(/([_.:-])/g, "$1\u200b");
+}
+
 /** A square in a part's colour. */
 function swatch(part) {
     const made = element("span", {className: "swatch"});
@@ -17,5 +22,9 @@ function swatch(part) {
 
 /** A number for a person, with so many digits that count. */
 function digits(x, count = 3) {
-    return x === 0 ? "0" : String(Number(x.toPrecision(count))).replace("-", "−");
+    return withMinus(String(Number(x.toPrecision(count))));
+}
+
+function withMinus(text) {
+    return (Number(text) === 0 ? text.replace("-", "") : text).replace("-", "−");
 }

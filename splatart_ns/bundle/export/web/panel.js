@@ -11,7 +11,7 @@ class Panel {
         object.parts.forEach((part, i) => {
             const box = element("input", {type: "checkbox", checked: true});
             box.addEventListener("change", () => owner.setShown(i, box.checked));
-            get("parts").append(element("label", {className: "part"}, box, swatch(part), part.name));
+            get("parts").append(element("label", {className: "part"}, box, swatch(part), breakable(part.name)));
         });
         this.playing = get("play");
         get("reset").addEventListener("click", () => owner.reset());
@@ -27,12 +27,12 @@ class Panel {
         const range = element("input", {type: "range", ...limits}), number = element("input", {type: "number", ...limits});
         range.setAttribute("list", marks.id);
         for (const input of [range, number]) {
-            input.setAttribute("aria-label", slider.label);
+            input.setAttribute("aria-label", `${slider.name} (${slider.unit})`);
             input.addEventListener("input", () => Number.isFinite(input.valueAsNumber) && moved(input.valueAsNumber));
         }
         const joint = this.object.joints[slider.joint];
         const head = element("div", {className: "head"},
-            swatch(this.object.parts[joint.child]), element("span", {className: "name"}, slider.name),
+            swatch(this.object.parts[joint.child]), element("span", {className: "name"}, breakable(slider.name)),
             number, element("span", {className: "unit"}, slider.unit));
         const observed = slider.observed.map(x => digits(x)).join(" to ");
         const note = element("div", {className: "note"}, `${joint.type}, observed ${observed} ${slider.unit}`);

@@ -11,9 +11,9 @@ function fillTable(object) {
             element("td", {}, joint.in_tree ? joint.type : `${joint.type}, closes a loop`),
             element("td", {}, parent.name),
             element("td", {}, child.name),
-            element("td", {}, hasAxis(joint) ? joint.axis.map(x => x.toFixed(3).replace("-", "−")).join(", ") : "–"),
+            element("td", {}, hasAxis(joint) ? joint.axis.map(x => withMinus(x.toFixed(3))).join(", ") : "–"),
             element("td", {}, observed(joint)),
-            element("td", {}, uncertainty(joint)),
+            element("td", {className: "long"}, uncertainty(joint)),
             element("td", {}, joint.ambiguous ? "yes" : "no"));
         if (joint.ambiguous) row.className = "ambiguous";
         return row;

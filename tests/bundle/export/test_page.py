@@ -1,0 +1,109 @@
+"""The page of `--format html`, without a browser."""
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from splatart_ns.bundle.export import export, page, validate
+from splatart_ns.bundle.export.page_model import PageModel
+from splatart_ns.bundle.export.quantization import quantized, restored
+
+KINDS = ("revolute", "prismatic", "screw", "cylindrical", "spherical", "free", "fixed")
+EVIL = '</script><img src=x onerror="alert(1)"><!--<script>{{scripts}}'
+
+
+@pytest.fixture
+def write(objects, tmp_path):
+    def write(bundle):
+        robot = objects.robot(bundle)
+        return export(bundle, robot, "html", tmp_path / "out"), robot
+
+    return write
+
+
+def verdicts(checks):
+    return {check.what: check.verdict for check in checks}
+
+
+def test_a_page_is_one_file_that_loads_nothing(objects, write):
+    path, _ = write(objects.chain(["revolute"]))
+    assert {file.name for file in path.parent.iterdir()} == {"thing.html", "export.json"}
+    text = path.read_text(encoding="utf-8")
+    assert "default-src 'none'" in text and "{{" not in text
+    assert re.findall(r"(?:src|href)\s*=\s*[\"'](?!data:)", text) == []
+    assert "://" not in text and "fetch(" not in text and "import(" not in text
+
+
+def test_its_data_are_the_bundles_and_checked(objects, write):
+    bundle = objects.chain(list(KINDS))
+    path, robot = write(bundle)
+    checks = validate(path, "html", bundle, robot)
+    assert verdicts(checks) == {"Gaussians": "passed", "part poses": "passed"}
+    other = objects.chain(list(KINDS))
+    other.joints[0].origin += 1e-3
+    other.parts[2] = replace(other.parts[2], splat=other.parts[2].splat.select(torch.arange(5)))
+    assert verdicts(validate(path, "html", other, robot)) == {"Gaussians": "failed", "part poses": "failed"}
+
+
+def test_no_name_gets_out_of_the_data(objects, write):
+    bundle = objects.chain(["revolute", "prismatic"])
+    bundle.parts[1].name = bundle.joints[0].child = bundle.joints[1].parent = EVIL
+    bundle.joints[0].name = EVIL + "\u2028"
+    bundle.length_unit = EVIL
+    bundle.provenance = {"version": EVIL}
+    path, _ = write(bundle)
+    text = path.read_text(encoding="utf-8")
+    assert "<img" not in text and text.count("</script>") == len(page._SCRIPTS) + 3
+    model = PageModel(path)
+    assert model.part_names[1] == EVIL and model.object["joints"][0]["name"] == EVIL + "\u2028"
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_packed_numbers_are_off_by_half_a_step_at_most(bits):
+    values = np.random.default_rng(0).normal(size=(200, 3)) * [1.0, 1e-3, 50.0]
+    values[:, 1] = 7.0  # a column without a range
+    column = quantized(values, bits)
+    half_steps = np.ptp(values, axis=0) / (2**bits - 1) / 2
+    assert (np.abs(restored(column) - values) <= half_steps * (1 + 1e-9)).all()
+    assert restored(quantized(values[:0], bits)).shape == (0, 3)
+
+
+def test_what_is_uncertain_or_undetermined_is_told(objects):
+    bundle = objects.chain(["revolute", "prismatic"])
+    joint = bundle.joints[0]
+    joint.covariance = {
+        "axis": (0.01**2 * np.eye(3)).tolist(),
+        "values": np.diag([0, 4e-4, 1e-4]).tolist(),
+        "origin": None,
+    }
+    joint.ambiguous = True
+    about = page.page_object(bundle, "thing")["joints"][0]
+    assert about["deviations"]["direction"] == pytest.approx(0.01) and about["deviations"]["place"] is None
+    assert about["deviations"]["values"] == pytest.approx([0.02]) and about["ambiguous"]
+    along = np.array(about["line"]["points"]) @ joint.axis.numpy()
+    distances = np.abs(along - joint.origin.numpy() @ joint.axis.numpy())
+    np.testing.assert_allclose(about["line"]["deviations"], 0.01 * distances, atol=1e-12)
+
+
+def test_loops_are_listed_after_the_tree_and_empty_parts_are_written(objects, write):
+    bundle = objects.chain(["revolute", "spherical"])
+    loop = objects.joint("closure", "revolute", "p2", "p0", 1, in_tree=False)
+    bundle.joints = [loop, *bundle.joints[::-1]]
+    bundle.parts[1] = replace(bundle.parts[1], splat=bundle.parts[1].splat.select(torch.arange(0)))
+    path, robot = write(bundle)
+    joints = PageModel(path).object["joints"]
+    assert [joint["name"] for joint in joints] == ["j1", "j2", "closure"]
+    assert [joint["in_tree"] for joint in joints] == [True, True, False]
+    assert set(verdicts(validate(path, "html", bundle, robot)).values()) == {"passed"}
+
+
+def test_needles_and_points_keep_their_size_where_it_can_be_seen(objects):
+    bundle = objects.chain(["revolute"])
+    bundle.parts[0].splat.log_scales[0] = torch.tensor([-1.0, -4.0, -40.0])
+    column = page.page_object(bundle, "thing")["parts"][0]["columns"]["log_scales"]
+    sizes = np.exp(restored(column)[0])
+    assert sizes[:2] == pytest.approx([math.exp(-1), math.exp(-4)], rel=0.02) and sizes[2] < 1e-3
