@@ -50,14 +50,15 @@ _SECTIONS = 12
 def write_page(bundle: Bundle, name: str, folder: Path) -> Path:
     """Write `<name>.html`, in the bundle's unit of length."""
     path = folder / f"{name}.html"
-    path.write_text(_page(page_object(bundle, name), bundle.provenance.get("version")), encoding="utf-8")
+    path.write_text(_page(name, page_object(bundle), bundle.provenance.get("version")), encoding="utf-8")
     return path
 
 
-def page_object(bundle: Bundle, title: str) -> dict[str, Any]:
+def page_object(bundle: Bundle) -> dict[str, Any]:
     """All that the page knows of the object, as JSON has it: parts with packed Gaussians, joints, sliders, first view.
 
-    Joints of the tree come first, parents before children; parts are named by their place in the list.
+    Joints of the tree come first, parents before children, and name parts by their place in the list. A slider has its
+    ends in its `unit`, and `units` is what a value of the bundle is multiplied by.
     """
     moves = movable_joints(bundle)
     ends = [{name: joint.values[state] for name, joint in moves.items()} for state in range(len(bundle.states))]
@@ -67,7 +68,6 @@ def page_object(bundle: Bundle, title: str) -> dict[str, Any]:
     colours = bundle_colours(bundle).tolist()
     return {
         "format": FORMAT,
-        "title": title,
         "parts": [_part(part, colour, radius) for part, colour in zip(bundle.parts, colours, strict=True)],
         "joints": [_joint(joint, bundle, radius) for joint in joints],
         "sliders": [
@@ -150,13 +150,13 @@ def _line(joint: Joint, points: np.ndarray, radius: float) -> dict[str, Any] | N
     return {"points": line.points(along).tolist(), "deviations": axis_deviation(joint, along).tolist()}
 
 
-def _page(about: dict[str, Any], version: Any) -> str:
+def _page(title: str, about: dict[str, Any], version: Any) -> str:
     """The template filled in one pass, so that what is put in is never looked at again."""
     files = resources.files("splatart_ns.bundle.export") / "web"
     style = (files / "page.css").read_text(encoding="utf-8")
     scripts = [(files / name).read_text(encoding="utf-8") for name in _SCRIPTS]
     texts = {
-        "title": html.escape(about["title"]),
+        "title": html.escape(title),
         "version": html.escape(str(version or "")),
         "style": style,
         "style hash": _hash(style),

@@ -81,7 +81,7 @@ def test_what_is_uncertain_or_undetermined_is_told(objects):
         "origin": None,
     }
     joint.ambiguous = True
-    about = page.page_object(bundle, "thing")["joints"][0]
+    about = page.page_object(bundle)["joints"][0]
     assert about["deviations"]["direction"] == pytest.approx(0.01) and about["deviations"]["place"] is None
     assert about["deviations"]["values"] == pytest.approx([0.02]) and about["ambiguous"]
     along = np.array(about["line"]["points"]) @ joint.axis.numpy()
@@ -104,6 +104,6 @@ def test_loops_are_listed_after_the_tree_and_empty_parts_are_written(objects, wr
 def test_needles_and_points_keep_their_size_where_it_can_be_seen(objects):
     bundle = objects.chain(["revolute"])
     bundle.parts[0].splat.log_scales[0] = torch.tensor([-1.0, -4.0, -40.0])
-    column = page.page_object(bundle, "thing")["parts"][0]["columns"]["log_scales"]
+    column = page.page_object(bundle)["parts"][0]["columns"]["log_scales"]
     sizes = np.exp(restored(column)[0])
     assert sizes[:2] == pytest.approx([math.exp(-1), math.exp(-4)], rel=0.02) and sizes[2] < 1e-3

@@ -1,6 +1,10 @@
 "use strict";
 // Making what a page is made of. Names come from strangers, so texts are only ever set as texts.
 
+function get(id) {
+    return document.getElementById(id);
+}
+
 /** An element with properties and children; children that are strings become text. */
 function element(tag, properties = {}, ...children) {
     const made = Object.assign(document.createElement(tag), properties);

@@ -3,6 +3,7 @@
 
 const TEXELS = 4;  // of a Gaussian: centre and part; three axes of its ellipsoid, with opacity and brightness
 const TEXTURE_WIDTH = 4096;
+const SH_C0 = 0.28209479177387814;  // a colour is 0.5 + SH_C0 times the first coefficient
 
 /** Values of a packed column: whole numbers of 8 or 16 bits, spread evenly between its lows and highs; row by row. */
 function unpack(column) {
@@ -64,8 +65,6 @@ class Gaussians {
         }
     }
 }
-
-const SH_C0 = 0.28209479177387814;
 
 /** Room for so many texels of four numbers, in whole rows of a texture. */
 function texels(count) {

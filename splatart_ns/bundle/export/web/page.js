@@ -16,8 +16,6 @@ class Page {
         this.pace = new Pace();
         this.canvas = get("picture");
         this.camera = new OrbitCamera(object.view);
-        document.title = object.title;
-        get("title").textContent = object.title;
         this.panel = new Panel(object, this);
         fillTable(object);
 

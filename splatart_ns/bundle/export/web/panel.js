@@ -50,7 +50,3 @@ class Panel {
         });
     }
 }
-
-function get(id) {
-    return document.getElementById(id);
-}

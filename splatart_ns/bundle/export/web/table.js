@@ -6,17 +6,15 @@ const DEGREES = 180 / Math.PI;
 function fillTable(object) {
     const rows = object.joints.map(joint => {
         const child = object.parts[joint.child], parent = object.parts[joint.parent];
-        const row = element("tr", {},
+        return element("tr", {},
             element("th", {scope: "row"}, swatch(child), joint.name),
             element("td", {}, joint.in_tree ? joint.type : `${joint.type}, closes a loop`),
             element("td", {}, parent.name),
             element("td", {}, child.name),
             element("td", {}, hasAxis(joint) ? joint.axis.map(x => withMinus(x.toFixed(3))).join(", ") : "–"),
             element("td", {}, observed(joint)),
-            element("td", {className: "long"}, uncertainty(joint)),
-            element("td", {}, joint.ambiguous ? "yes" : "no"));
-        if (joint.ambiguous) row.className = "ambiguous";
-        return row;
+            element("td", {className: joint.ambiguous ? "warning" : ""}, joint.ambiguous ? "yes" : "no"),
+            element("td", {}, uncertainty(joint)));
     });
     get("joints").append(...rows);
     get("table").hidden = rows.length === 0;
