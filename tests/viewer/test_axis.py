@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from splatart_ns.bundle.joint_axis import axis_deviation
 from splatart_ns.viewer.axis import joint_mesh
 
 POINTS = np.array([[0.0, -0.5, 0.7], [0, 0.5, 0.7], [0.5, 0, 0.7]])
@@ -42,19 +41,6 @@ def test_an_uncertain_axis_is_thicker_and_most_at_its_ends(bundle):
         v = joint_mesh(joint, POINTS, 1.0).vertices - lid.origin.numpy()
         radius[name] = np.linalg.norm(v[v[:, 1] < -0.6][:, [0, 2]], axis=1).max()
     assert radius["uncertain"] - radius["certain"] == pytest.approx(2 * 0.01 * 0.73, rel=0.1)
-
-
-def test_the_deviation_of_an_axis_is_that_of_samples(bundle):
-    rng = np.random.default_rng(0)
-    root = 0.01 * rng.normal(size=(6, 6))
-    C = root @ root.T
-    samples = rng.multivariate_normal(np.zeros(6), C, size=200_000)
-    blocks = {"axis": C[:3, :3], "origin": C[3:, 3:], "axis_origin": C[:3, 3:]}
-    joint = replace(bundle.joints[0], covariance={name: block.tolist() for name, block in blocks.items()})
-    along = np.array([-1.0, 0.0, 2.0])
-    for s, found in zip(along, axis_deviation(joint, along), strict=True):
-        places = samples[:, 3:] + s * samples[:, :3]
-        assert found == pytest.approx(np.sqrt(np.linalg.eigvalsh(np.cov(places.T))[-1]), rel=0.02)
 
 
 def test_a_ball_is_shown_at_the_centre_of_a_spherical_joint(bundle):
