@@ -2,12 +2,11 @@
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from splatart_ns.plugin import compat  # noqa: F401  (lets torch read nerfstudio's checkpoints)
+from splatart_ns.plugin.compat import FusedAdamOptimizerConfig
 from splatart_ns.plugin.datamanager import SplatartDatamanagerConfig
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.plugin.pose import PoseModelConfig, PosePipelineConfig
@@ -17,7 +16,7 @@ MERGE_STEPS = 400
 
 
 def _adam(lr: float) -> dict:
-    return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": None}
+    return {"optimizer": FusedAdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": None}
 
 
 method = MethodSpecification(
@@ -35,7 +34,7 @@ method = MethodSpecification(
         ),
         optimizers={
             "part_poses": {
-                "optimizer": AdamOptimizerConfig(lr=3e-3, eps=1e-15),
+                "optimizer": FusedAdamOptimizerConfig(lr=3e-3, eps=1e-15),
                 "scheduler": ExponentialDecaySchedulerConfig(lr_final=1e-4, max_steps=DESCENT_STEPS),
             },
             # Of the merged Gaussians: they are nearly right.

@@ -2,12 +2,11 @@
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from splatart_ns.plugin import compat  # noqa: F401  (lets torch read nerfstudio's checkpoints)
+from splatart_ns.plugin.compat import FusedAdamOptimizerConfig
 from splatart_ns.plugin.datamanager import SplatartDatamanagerConfig
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.plugin.semantic import SemanticModelConfig, SemanticPipelineConfig
@@ -18,7 +17,7 @@ PART_STEPS = 100
 
 def _adam(lr: float, final: float | None = None) -> dict:
     scheduler = None if final is None else ExponentialDecaySchedulerConfig(lr_final=lr * final, max_steps=STEPS)
-    return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": scheduler}
+    return {"optimizer": FusedAdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": scheduler}
 
 
 method = MethodSpecification(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -173,5 +175,5 @@ def footprint(view: View, size: float) -> int:
 
 def widened(mask: Tensor, reach: int) -> Tensor:
     """A mask [H, W] with all pixels that are at most `reach` pixels aside and up or down."""
-    pooled = F.max_pool2d(mask[None, None].float(), 2 * reach + 1, stride=1, padding=reach)
-    return pooled[0, 0] > 0
+    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    return torch.from_numpy(cv2.dilate(mask.numpy().view(np.uint8), square)).bool()

@@ -80,8 +80,9 @@ class PoseModel(SplatartModel):
         """The merged Gaussians at an observed state, T [S, P, 4, 4], without parts whose pose there is not known."""
         known = self.covariance[state].isfinite().flatten(1).all(-1)
         splat = self.splat
-        shown = torch.cat([torch.ones_like(known[:1]), known])[splat.part_ids]
-        return carry([splat.select(shown)], T[[0, state]], 0, 1)
+        if not known.all():
+            splat = splat.select(torch.cat([torch.ones_like(known[:1]), known])[splat.part_ids])
+        return splat if state == 0 else carry([splat], T[[0, state]], 0, 1)
 
     @torch.no_grad()
     def posed_splat(self) -> Splat:

@@ -26,7 +26,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from splatart_ns.errors import InputError
-from splatart_ns.plugin.compat import seed_everything
+from splatart_ns.plugin.compat import seed_everything, stop_event_writers
 from splatart_ns.rasterize.rasterization import Backend, set_backend
 
 Outcome = dict[str, Any]
@@ -40,6 +40,7 @@ def run_stage(config: TrainerConfig, on_step: Callable[[int], None]) -> Outcome:
     config.save_config()
     trainer: Trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
+    stop_event_writers()
     after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
     trainer.callbacks.append(TrainingCallback(after, lambda step: on_step(step + 1)))
     trainer.train()
