@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "viewer"))
 from browser import By, Keys, headless_chromium
 from viewer_client import free_port
 
-from splatart_ns.bundle import load_bundle
+from splatart_ns.bundle import load
 from splatart_ns.viewer.viewer import Viewer
 
 START_SECONDS, MOVE_SECONDS = 15, 2
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--moves", type=int, default=20)
     arguments = parser.parse_args()
     port = free_port()
-    viewer = Viewer(load_bundle(arguments.bundle), "127.0.0.1", port)
+    viewer = Viewer(load(arguments.bundle), "127.0.0.1", port)
     threading.Thread(target=viewer.run, daemon=True).start()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         page = headless_chromium(Path(folder) / "profile", Path(folder) / "downloads")

@@ -90,26 +90,27 @@ def render(
         background: Colour behind the object, 0 to 1.
         rasterizer: As in `splatart fit`.
     """
-    from splatart_ns.bundle import animation, configurations, load_bundle, viewpoint
+    from splatart_ns.bundle import animation, configurations, load
+    from splatart_ns.bundle import camera as cameras
     from splatart_ns.capture.formats import load_capture
 
     if sweep and trajectory is not None:
         raise InputError("--sweep and --trajectory are both given; choose one.")
     _check_numbers(frames, fps, resolution, azimuth, elevation, background)
     _choose_rasterizer(rasterizer)
-    loaded = load_bundle(bundle)
-    base = configurations.parse_settings(sum(set, ()), loaded)
+    splat = load(bundle)
+    base = configurations.parse_settings(sum(set, ()), splat.bundle)
     if trajectory is not None:
-        path = [base | q for q in configurations.read_trajectory(trajectory, loaded)]
+        path = [base | q for q in configurations.read_trajectory(trajectory, splat.bundle)]
     else:
-        path = configurations.sweep(loaded, base, frames) if sweep else [base]
+        path = configurations.sweep(splat.bundle, base, frames) if sweep else [base]
     if data is not None:
-        view = viewpoint.capture_viewpoint(load_capture(data), camera)
+        view = cameras.capture_camera(load_capture(data), camera)
     else:
-        turn = viewpoint.front_azimuth(loaded) + math.radians(40) if azimuth is None else math.radians(azimuth)
-        sphere = viewpoint.bounding_sphere(loaded, path)
-        view = viewpoint.orbit_viewpoint(*sphere, turn, math.radians(elevation), resolution, resolution)
-    images = animation.render_frames(loaded, path, view, channel, background, _device())
+        turn = cameras.front_azimuth(splat.bundle) + math.radians(40) if azimuth is None else math.radians(azimuth)
+        sphere = cameras.bounding_sphere(splat.bundle, path)
+        view = cameras.orbit_camera(*sphere, turn, math.radians(elevation), resolution, resolution)
+    images = animation.render_frames(splat, path, view, channel, background)
     CONSOLE.print(f"{animation.write_frames(images, output, fps)} frames: {output}")
 
 
@@ -148,13 +149,13 @@ def view(
         port: Port of the page, 1 to 65535.
         rasterizer: As in `splatart fit`.
     """
-    from splatart_ns.bundle import load_bundle
+    from splatart_ns.bundle import load
     from splatart_ns.viewer.viewer import Viewer
 
     if not 0 < port < 65536:
         raise InputError(f"--port is {port}; give 1 to 65535.")
     _choose_rasterizer(rasterizer)
-    viewer = Viewer(load_bundle(bundle), host, port)
+    viewer = Viewer(load(bundle), host, port)
     CONSOLE.print(f"Open http://{host}:{port} in a browser. Ctrl-C ends.")
     with contextlib.suppress(KeyboardInterrupt):
         viewer.run()

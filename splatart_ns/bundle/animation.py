@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,69 +14,54 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from splatart_ns.bundle.articulated_splat import ArticulatedSplat, Picture
 from splatart_ns.bundle.bundle import Bundle
-from splatart_ns.bundle.posing import normalized, part_features, posed_splat
-from splatart_ns.bundle.viewpoint import Viewpoint, bounding_sphere
-from splatart_ns.capture.capture import Normalization
+from splatart_ns.bundle.camera import Camera, bounding_sphere
+from splatart_ns.bundle.configurations import Configuration
 from splatart_ns.errors import InputError
 from splatart_ns.files import replacing
-from splatart_ns.geometry.camera import viewmat_from_opengl
-from splatart_ns.rasterize.render import Rendering, render
 from splatart_ns.splats.palette import part_colours
 
 Output = Literal["rgb", "depth", "accumulation", "parts"]
 
 
-@torch.no_grad()
 def render_frames(
-    bundle: Bundle,
-    configurations: Sequence[Mapping[str, float]],
-    viewpoint: Viewpoint,
+    splat: ArticulatedSplat,
+    configurations: Sequence[Configuration],
+    camera: Camera,
     output: Output = "rgb",
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    device: torch.device | str = "cpu",
 ) -> Iterator[np.ndarray]:
-    """Render one frame per configuration on `device`, uint8 [H, W, 3] RGB.
+    """Render one frame per configuration, uint8 [H, W, 3] RGB.
 
     `background` is in 0..1. Depth is shown in colours, red near and blue far, over the depths that the object can have;
     parts have the colours of `bundle_colours`; accumulation is grey.
     """
-    centre, radius = bounding_sphere(bundle, configurations)
-    # The renderer's near plane is a fixed length, so the object is brought to the size of one unit.
-    normalization = Normalization(centre, 1 / radius)
-    T = torch.from_numpy(normalization.camera_to_normal(viewpoint.T_world_camera))
-    viewmat = viewmat_from_opengl(T).float()[None].to(device)
-    camera = viewpoint.camera
-    K = torch.from_numpy(camera.K).float()[None].to(device)
-    features = (part_features(bundle) @ bundle_colours(bundle)).to(device)
-    distance = float(T[:3, 3].norm())
-    for configuration in configurations:
-        rendering = render(
-            normalized(posed_splat(bundle, configuration), normalization).to(device),
-            viewmat,
-            K,
-            camera.width,
-            camera.height,
-            features=features if output == "parts" else None,
-            with_depth=output == "depth",
-        )
-        image = _image(rendering, output, torch.tensor(background), (distance - 1, distance + 1))
-        yield (255 * image.clamp(0, 1)).round().byte().numpy()
+    centre, radius = bounding_sphere(splat.bundle, configurations)
+    distance = float(np.linalg.norm(camera.T_world_camera[:3, 3].numpy() - centre))
+    depths = (distance - radius, distance + radius)
+    colours = bundle_colours(splat.bundle)
+    for q in configurations:
+        picture = splat.render(camera, q, depth=output == "depth", labels=output == "parts")
+        image = _image(picture, output, colours, torch.tensor(background), depths)
+        yield (255 * image).round().byte().numpy()
 
 
-def _image(rendering: Rendering, output: Output, background: Tensor, depths: tuple[float, float]) -> Tensor:
+def _image(
+    picture: Picture, output: Output, colours: Tensor, background: Tensor, depths: tuple[float, float]
+) -> Tensor:
     """What is shown [H, W, 3] in 0..1."""
-    accumulation = rendering.accumulation[0].cpu()
+    alpha = picture.alpha.cpu()
     if output == "accumulation":
-        return accumulation.expand(-1, -1, 3)
+        return alpha[..., None].expand(-1, -1, 3)
     if output == "depth":
         near, far = depths
-        share = ((far - rendering.depth[0, ..., 0].cpu()) / (far - near)).clamp(0, 1)
-        colours = cv2.applyColorMap((255 * share).round().byte().numpy(), cv2.COLORMAP_TURBO)[..., ::-1]
-        image = accumulation * torch.from_numpy(colours.copy()) / 255
-    else:
-        image = (rendering.rgb if output == "rgb" else rendering.features)[0].cpu()
-    return image + (1 - accumulation) * background
+        share = ((far - picture.depth.cpu()) / (far - near)).clamp(0, 1)
+        shown = cv2.applyColorMap((255 * share).round().byte().numpy(), cv2.COLORMAP_TURBO)[..., ::-1]
+        picture = replace(picture, rgb=alpha[..., None] * torch.from_numpy(shown.copy()) / 255, alpha=alpha)
+    elif output == "parts":
+        picture = replace(picture, rgb=picture.part_shares.cpu() @ colours, alpha=alpha)
+    return picture.over(background).cpu()
 
 
 def bundle_colours(bundle: Bundle) -> Tensor:

@@ -60,17 +60,13 @@ def fit_configuration(bundle: Bundle, views: Sequence[View], normalization: Norm
             continue
         parent = configured_motions(bundle, q)[joint.parent]
         values = sweep_values(joint)
-        motions = torch.stack([parent @ joint_motion(joint, value) for value in values])
+        motions = parent @ joint_motion(joint, values)
         costs = _cost(splats[joint.child], coarse[joint.child], _to_normal(motions, normalization))
         q[joint.name] = values[int(costs.argmin())]
 
     def motions_at(x: Tensor) -> dict[str, Tensor]:
         """Of a batch of all values [K, D]: T[part] [K, 4, 4] in the normalised world."""
-        each = [configured_motions(bundle, _split(joints, row)) for row in x]
-        return {
-            name: _to_normal(torch.stack([motions[name] for motions in each]), normalization)
-            for name in bundle.part_names
-        }
+        return {name: _to_normal(T, normalization) for name, T in configured_motions(bundle, _split(joints, x)).items()}
 
     unseen = [part.name for part in bundle.parts if not coarse[part.name]]
     moving = {joint.child: splats[joint.child] for joint in joints if fine[joint.child]}
@@ -167,8 +163,9 @@ def _refine(
 
 
 def _split(joints: Sequence[Joint], x: Tensor) -> dict[str, Tensor]:
-    widths = [joint.values[0].numel() for joint in joints]
-    return {j.name: v.reshape(j.values[0].shape) for j, v in zip(joints, x.split(widths), strict=True)}
+    """The values x [..., D] of all joints side by side, joint by joint."""
+    parts = x.split([joint.values[0].numel() for joint in joints], -1)
+    return {j.name: v if j.values.ndim > 1 else v[..., 0] for j, v in zip(joints, parts, strict=True)}
 
 
 def _units(joint: Joint, normalization: Normalization) -> Tensor:

@@ -6,38 +6,60 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
 from splatart_ns.capture.capture import Normalization
+from splatart_ns.errors import InputError
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import joint as stage
 
-JointValue = float | Sequence[float] | Tensor
-"""Radians or length; as many numbers as the joint has degrees of freedom, in the order of `Joint.values`."""
+JointValue = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | Tensor
+"""Radians or length: [...] for a joint of one freedom, [..., D] for one of D, in the order of `Joint.values`."""
 
 
 def joint_motion(joint: Joint, value: JointValue) -> Tensor:
-    """The child's motion relative to its parent [4, 4] float64, canonical frame, at a value (0 gives the identity)."""
-    value = torch.as_tensor(value, dtype=torch.float64)
+    """The child's motion relative to its parent [..., 4, 4] float64, canonical frame, at values (0 gives the identity).
+
+    Differentiable in `value`. Raises InputError for values of the wrong shape, or not finite.
+    """
+    try:
+        value = torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"joint '{joint.name}': {value!r} are no numbers; give radians or lengths") from error
     dofs = JOINT_DOFS[joint.type]
-    if value.shape not in ({torch.Size([])} if dofs <= 1 else {torch.Size([dofs])}):
-        raise ValueError(f"joint '{joint.name}' is {joint.type} and takes {dofs} values, not shape {list(value.shape)}")
+    if dofs > 1 and value.shape[-1:] != (dofs,):
+        found = f"is {joint.type} and takes {dofs} values, not shape {list(value.shape)}"
+        raise InputError(f"joint '{joint.name}' {found}; give [{dofs}], or [B, {dofs}] for B configurations")
+    if not value.isfinite().all():
+        raise InputError(f"joint '{joint.name}' has a value that is not finite; give radians or lengths")
     return stage.joint_motion(joint.type, joint.axis, joint.origin, joint.pitch, value)
 
 
 def configured_motions(bundle: Bundle, q: Mapping[str, JointValue]) -> dict[str, Tensor]:
-    """T[part] [4, 4] float64, canonical frame to the configuration `q` (joint name to value; the others are 0).
+    """T[part] [..., 4, 4] float64, canonical frame to the configuration `q` (joint name to value; the others are 0).
 
-    The root stays where it is at state 0, and so do parts that hang on nothing. Raises KeyError for an unknown name.
+    The batches of the values broadcast. The root stays where it is at state 0, and so do parts that hang on nothing.
+    Values beyond the limits are taken. Raises InputError for an unknown name, and as `joint_motion` does.
     """
-    if unknown := set(q) - {joint.name for joint in bundle.tree_joints}:
-        raise KeyError(f"no tree joint is called {', '.join(sorted(unknown))}")
-    motions = {name: torch.eye(4, dtype=torch.float64) for name in bundle.part_names}
-    for joint in bundle.tree_joints:
-        value = q.get(joint.name, torch.zeros_like(joint.values[0]))
-        motions[joint.child] = motions[joint.parent] @ joint_motion(joint, value)
+    joints = bundle.tree_joints
+    names = {joint.name for joint in joints}
+    if unknown := set(q) - names:
+        known = ", ".join(joint.name for joint in joints) or "none"
+        raise InputError(f"no tree joint is called {', '.join(sorted(map(str, unknown)))}; there are {known}")
+    relative = {
+        joint.name: joint_motion(joint, q.get(joint.name, torch.zeros_like(joint.values[0]))) for joint in joints
+    }
+    try:
+        batch = torch.broadcast_shapes(*(T.shape[:-2] for T in relative.values()))
+    except RuntimeError as error:
+        sizes = ", ".join(f"{name} {list(T.shape[:-2])}" for name, T in relative.items() if T.ndim > 2)
+        raise InputError(f"the joints' values are of different batches: {sizes}; give as many of each") from error
+    motions = {name: torch.eye(4, dtype=torch.float64).expand(*batch, 4, 4) for name in bundle.part_names}
+    for joint in joints:
+        motions[joint.child] = motions[joint.parent] @ relative[joint.name]
     return motions
 
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from splatart_ns.bundle.articulated_splat import predicted_parts
 from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
 from splatart_ns.bundle.posing import configured_motions, moved_splat, normalized, part_features
 from splatart_ns.capture.capture import UNLABELLED, Capture
@@ -31,15 +32,6 @@ def part_overlap(ids: Tensor, labels: Tensor, parts: Sequence[int]) -> Tensor:
     labelled = labels != UNLABELLED
     pairs = [((ids == part) & labelled, labels == part) for part in parts]
     return torch.tensor([[int((a & b).sum()), int((a | b).sum())] for a, b in pairs])
-
-
-def predicted_parts(accumulation: Tensor, features: Tensor, ids: Tensor) -> Tensor:
-    """The likeliest part id [H, W] of rendered accumulation [H, W, 1] and one-hot part features [H, W, P].
-
-    `ids` [P] are the ids of the parts; 0 where most is background.
-    """
-    shares = torch.cat([1 - accumulation, features], dim=-1)
-    return torch.cat([ids.new_zeros(1), ids])[shares.argmax(-1)]
 
 
 def image_scores(

@@ -127,7 +127,7 @@ def joint_errors(truth: TrueJoint, ground_truth: GroundTruth, bundle: Bundle) ->
         T = torch.linalg.solve(bundle.part(parent).motion, bundle.part(child).motion)[moved]
         note = f"the estimate hangs it on {other.parent}: no axis, motions from the part poses"
     else:
-        T = torch.stack([joint_motion(joint, value) for value in joint.values[moved]])
+        T = joint_motion(joint, joint.values[moved])
         T = T if joint.child == child else inverse(T)
         note = _compare_axes(record, joint, truth)
     if len(T) > 0:

@@ -1,22 +1,22 @@
-"""Images of a bundle for cameras that move: what does not depend on the configuration is made once."""
+"""A bundle as browsers see it: images from where they look."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from splatart_ns.bundle.animation import bundle_colours
-from splatart_ns.bundle.bundle import Bundle
-from splatart_ns.bundle.posing import normalized
+from splatart_ns.bundle.articulated_splat import ArticulatedSplat
+from splatart_ns.bundle.camera import Camera
+from splatart_ns.bundle.posing import JointValue
 from splatart_ns.capture.capture import Normalization
-from splatart_ns.geometry.se3 import inverse, matrix_from_quat
+from splatart_ns.geometry.se3 import matrix_from_quat
 from splatart_ns.geometry.spherical_harmonics import SH_C0
-from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 
 _OWN_COLOUR = 0.7
@@ -25,7 +25,7 @@ _OWN_COLOUR = 0.7
 
 @dataclass(frozen=True)
 class Eye:
-    """Where a browser looks from: viser's camera, OpenCV axes, in the normalised world."""
+    """Where a browser looks from: viser's camera, OpenCV axes, in the scene's world."""
 
     wxyz: np.ndarray
     position: np.ndarray
@@ -34,51 +34,50 @@ class Eye:
     aspect: float
     """Width over height."""
 
+    def camera(self, height: int, scene: Normalization) -> Camera:
+        """The camera in the bundle's world, where `scene` brings that to the scene's."""
+        width = max(1, round(height * self.aspect))
+        T = torch.eye(4, dtype=torch.float64)
+        T[:3, :3] = matrix_from_quat(torch.from_numpy(self.wxyz).double()) * torch.tensor([1, -1, -1])
+        T[:3, 3] = torch.from_numpy(self.position / scene.scale + scene.centre)
+        focal = height / 2 / np.tan(self.fov / 2)
+        return Camera(T, (focal, focal, width / 2, height / 2), width, height)
+
 
 class Renderer:
-    """Renders a bundle's parts, each in its own place."""
+    """Renders a bundle as the panel says."""
 
-    def __init__(self, bundle: Bundle, normalization: Normalization, device: torch.device | str):
-        """`normalization` brings the object to a radius of about 1 about the origin."""
-        splats = {part.name: normalized(part.splat, normalization).to(device) for part in bundle.parts}
-        width = max(splat.sh.shape[1] for splat in splats.values())
-        self._splats = {
-            name: replace(splat, sh=pad(splat.sh, (0, 0, 0, width - splat.sh.shape[1])))
-            for name, splat in splats.items()
-        }
-        colours = dict(zip(bundle.part_names, bundle_colours(bundle).to(device), strict=True))
-        self._coloured = {name: _in_colour(splat, colours[name]) for name, splat in splats.items()}
+    def __init__(self, splat: ArticulatedSplat):
+        self._splat = splat
 
-    @torch.no_grad()
     def image(
         self,
-        motions: Mapping[str, Tensor],
+        q: Mapping[str, JointValue],
         eye: Eye,
         height: int,
         hidden: Collection[str] = (),
         by_part: bool = False,
     ) -> np.ndarray:
-        """What the eye sees on white, uint8 [height, W, 3] RGB.
+        """What the eye sees of the configuration `q` on white, uint8 [height, W, 3] RGB.
 
         Args:
-            motions: T[part] [4, 4] of the normalised world.
             hidden: Parts that are left out.
             by_part: Show the parts in the colours of `bundle_colours`, shaded by their own.
         """
-        width = max(1, round(height * eye.aspect))
-        splats = self._coloured if by_part else self._splats
-        shown = [splat.transformed(motions[name]) for name, splat in splats.items() if name not in hidden]
-        if not shown:
-            return np.full((height, width, 3), 255, np.uint8)
-        splat = Splat.cat(shown)
-        T = torch.eye(4, dtype=torch.float64)
-        T[:3, :3] = matrix_from_quat(torch.from_numpy(eye.wxyz).double())
-        T[:3, 3] = torch.from_numpy(eye.position)
-        focal = height / 2 / np.tan(eye.fov / 2)
-        K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]).to(splat.means)
-        seen = render(splat, inverse(T)[None].to(splat.means), K[None], width, height, with_depth=False)
-        image = (seen.rgb + 1 - seen.accumulation)[0].clamp(0, 1)
-        return (255 * image).round().byte().cpu().numpy()
+        camera, splat = eye.camera(height, self._splat.normalization), self._coloured if by_part else self._splat
+        picture = splat.render(camera, q, parts=self._shown(hidden), depth=False, labels=False)
+        return (255 * picture.over(torch.ones(3))).round().byte().cpu().numpy()
+
+    def _shown(self, hidden: Collection[str]) -> list[str]:
+        return [name for name in self._splat.part_names if name not in hidden]
+
+    @cached_property
+    def _coloured(self) -> ArticulatedSplat:
+        """The object in part colours."""
+        bundle = self._splat.bundle
+        coloured = zip(bundle.parts, bundle_colours(bundle), strict=True)
+        parts = [replace(part, splat=_in_colour(part.splat, colour)) for part, colour in coloured]
+        return ArticulatedSplat(replace(bundle, parts=parts), self._splat.device)
 
 
 def _in_colour(splat: Splat, colour: Tensor) -> Splat:

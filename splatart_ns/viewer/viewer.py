@@ -18,11 +18,9 @@ import viser
 from PIL import Image
 from torch import Tensor
 
-from splatart_ns.bundle.bundle import Bundle
-from splatart_ns.bundle.configurations import Configuration, movable_joints, sweep
-from splatart_ns.bundle.posing import configured_motions
-from splatart_ns.bundle.viewpoint import bounding_sphere, front_azimuth, orbit_viewpoint
-from splatart_ns.capture.capture import Normalization
+from splatart_ns.bundle.articulated_splat import ArticulatedSplat
+from splatart_ns.bundle.camera import front_azimuth, orbit_camera
+from splatart_ns.bundle.configurations import Configuration, sweep
 from splatart_ns.errors import InputError
 from splatart_ns.viewer.axis import Axes
 from splatart_ns.viewer.panel import Panel
@@ -52,17 +50,13 @@ class Viewer:
         InputError: when the port cannot be opened, or nothing of the bundle is visible.
     """
 
-    def __init__(self, bundle: Bundle, host: str, port: int):
-        self._bundle = bundle
-        joints = movable_joints(bundle)
-        ends = [{name: joint.values[state] for name, joint in joints.items()} for state in range(len(bundle.states))]
-        centre, radius = bounding_sphere(bundle, [{}, *ends])
-        self._normalization = Normalization(centre, 1 / radius)
-        self._renderer = Renderer(bundle, self._normalization, "cuda" if torch.cuda.is_available() else "cpu")
+    def __init__(self, splat: ArticulatedSplat, host: str, port: int):
+        self._splat, self._bundle = splat, splat.bundle
+        self._renderer = Renderer(splat)
         require_free(host, port)
-        self.server = viser.ViserServer(host, port, label=bundle.root, verbose=False)
-        self.axes = Axes(self.server, bundle, self._normalization)
-        self.panel = Panel(self.server, bundle)
+        self.server = viser.ViserServer(host, port, label=self._bundle.root, verbose=False)
+        self.axes = Axes(self.server, self._bundle, splat.normalization)
+        self.panel = Panel(self.server, self._bundle)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._is_due = False
         """Whether an image of what moved is asked for already."""
@@ -117,10 +111,10 @@ class Viewer:
         panel.save_picture.on_click(lambda event: jobs.put(lambda: self._save_picture(event.client)))
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        view = orbit_viewpoint(np.zeros(3), 1.0, front_azimuth(self._bundle) + _AZIMUTH, _ELEVATION, 1, 1)
+        start = orbit_camera(np.zeros(3), 1.0, front_azimuth(self._bundle) + _AZIMUTH, _ELEVATION, 1, 1)
         with client.atomic():
             client.camera.fov = _FIELD_OF_VIEW
-            client.camera.position = view.T_world_camera[:3, 3]
+            client.camera.position = start.T_world_camera[:3, 3].numpy()
             client.camera.look_at = np.zeros(3)
         client.camera.on_update(lambda _: self._changed())
         self._changed()
@@ -151,22 +145,21 @@ class Viewer:
         self._rest_at = time.monotonic() + _REST_SECONDS
 
     def _draw(self, rows: int) -> None:
-        motions = self._motions()
         self.axes.show(self.panel.axes.value)
-        self.axes.move(motions)
+        self.axes.move(self._motions())
         for client in self.server.get_clients().values():
-            client.scene.set_background_image(self._image(client, motions, rows), "jpeg", jpeg_quality=85)
+            client.scene.set_background_image(self._image(client, rows), "jpeg", jpeg_quality=85)
 
-    def _image(self, client: viser.ClientHandle, motions: dict[str, Tensor], rows: int) -> np.ndarray:
+    def _image(self, client: viser.ClientHandle, rows: int) -> np.ndarray:
         camera, panel = client.camera, self.panel
         aspect = min(max(camera.aspect, 1 / _MAX_ASPECT), _MAX_ASPECT)
         eye = Eye(camera.wxyz, camera.position, camera.fov, aspect)
-        return self._renderer.image(motions, eye, rows, panel.hidden, panel.by_part.value)
+        return self._renderer.image(panel.q, eye, rows, panel.hidden, panel.by_part.value)
 
     def _motions(self) -> dict[str, Tensor]:
         """T[part] [4, 4] of the normalised world, as the sliders say."""
-        motions = configured_motions(self._bundle, self.panel.q)
-        return {name: torch.from_numpy(self._normalization.motion_to_normal(T.numpy())) for name, T in motions.items()}
+        poses, scene = self._splat.link_poses(self.panel.q), self._splat.normalization
+        return {name: torch.from_numpy(scene.motion_to_normal(T.numpy())) for name, T in poses.items()}
 
     def _reset(self) -> None:
         self._end_sweep()
@@ -182,7 +175,7 @@ class Viewer:
 
     def _save_picture(self, client: viser.ClientHandle) -> None:
         file = io.BytesIO()
-        Image.fromarray(self._image(client, self._motions(), _ROWS)).save(file, "PNG")
+        Image.fromarray(self._image(client, _ROWS)).save(file, "PNG")
         _send(client, "picture.png", file.getvalue())
 
 

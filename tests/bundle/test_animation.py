@@ -1,10 +1,13 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from splatart_ns.bundle.animation import bundle_colours, render_frames, write_frames
-from splatart_ns.bundle.viewpoint import Viewpoint, bounding_sphere, orbit_viewpoint
+from splatart_ns.bundle.articulated_splat import ArticulatedSplat
+from splatart_ns.bundle.camera import bounding_sphere, orbit_camera
 from splatart_ns.errors import InputError
 
 FRAMES = [np.full((31, 41, 3), value, np.uint8) for value in (10, 128, 250)]
@@ -12,7 +15,7 @@ FRAMES = [np.full((31, 41, 3), value, np.uint8) for value in (10, 128, 250)]
 
 @pytest.fixture
 def view(bundle):
-    return orbit_viewpoint(*bounding_sphere(bundle, [{}, {"hinge": 1.5}]), -1.2, 0.5, 48, 40)
+    return orbit_camera(*bounding_sphere(bundle, [{}, {"hinge": 1.5}]), -1.2, 0.5, 48, 40)
 
 
 def test_a_joint_moves_what_hangs_on_it_alone(bundle, view):
@@ -20,17 +23,17 @@ def test_a_joint_moves_what_hangs_on_it_alone(bundle, view):
     base.log_scales += 0.5
     for part in door:
         part.splat.opacity_logits[:] = -12.0
-    still, moved = render_frames(bundle, [{}, {"hinge": 1.5}], view)
+    still, moved = render_frames(ArticulatedSplat(bundle), [{}, {"hinge": 1.5}], view)
     assert still.shape == (40, 48, 3) and still.dtype == np.uint8
     assert np.array_equal(still, moved) and (still < 255).any()
     for part in door:
         part.splat.opacity_logits[:] = 3.0
-    still, moved = render_frames(bundle, [{}, {"hinge": 1.5}], view)
+    still, moved = render_frames(ArticulatedSplat(bundle), [{}, {"hinge": 1.5}], view)
     assert not np.array_equal(still, moved)
 
 
 def test_the_background_is_the_colour_asked_for(bundle, view):
-    (frame,) = render_frames(bundle, [{}], view, background=(0.0, 0.2, 1.0))
+    (frame,) = render_frames(ArticulatedSplat(bundle), [{}], view, background=(0.0, 0.2, 1.0))
     assert frame[0, 0].tolist() == [0, 51, 255]
 
 
@@ -38,7 +41,7 @@ def test_parts_have_their_colours(bundle, view):
     for part in bundle.parts:
         part.splat.log_scales += 0.7
         part.splat.opacity_logits[:] = 8.0
-    (frame,) = render_frames(bundle, [{}], view, "parts", background=(0.0, 0.0, 0.0))
+    (frame,) = render_frames(ArticulatedSplat(bundle), [{}], view, "parts", background=(0.0, 0.0, 0.0))
     pixels = torch.from_numpy(frame).float().reshape(-1, 3) / 255
     distances = torch.cdist(bundle_colours(bundle), pixels).amin(1)
     assert (distances < 0.06).all()
@@ -47,9 +50,9 @@ def test_parts_have_their_colours(bundle, view):
 def test_accumulation_is_grey_and_depth_tells_near_from_far(bundle, view):
     for part in bundle.parts:
         part.splat.log_scales += 0.7
-    (accumulation,) = render_frames(bundle, [{}], view, "accumulation")
+    (accumulation,) = render_frames(ArticulatedSplat(bundle), [{}], view, "accumulation")
     assert (accumulation[..., 0] == accumulation[..., 2]).all() and accumulation.max() > 200
-    (depth,) = render_frames(bundle, [{}], view, "depth", background=(0.0, 0.0, 0.0))
+    (depth,) = render_frames(ArticulatedSplat(bundle), [{}], view, "depth", background=(0.0, 0.0, 0.0))
     covered = accumulation[..., 0] > 200
     assert len(np.unique(depth[covered], axis=0)) > 5
 
@@ -60,9 +63,12 @@ def test_the_unit_of_length_does_not_matter(bundle, view, output):
         for part in bundle.parts:
             part.splat.means *= scale
             part.splat.log_scales += np.log(scale)
-        T = view.T_world_camera.copy()
+        for joint in bundle.joints:
+            joint.origin *= scale
+        bundle.joints[0].values *= scale  # the one that slides
+        T = view.T_world_camera.clone()
         T[:3, 3] *= scale
-        return next(render_frames(bundle, [{}], Viewpoint(view.camera, T), output)).astype(int)
+        return next(render_frames(ArticulatedSplat(bundle), [{}], replace(view, T_world_camera=T), output)).astype(int)
 
     assert np.abs(frame(1.0) - frame(2.0**-10)).max() <= 2
 

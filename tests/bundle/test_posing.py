@@ -13,6 +13,7 @@ from splatart_ns.bundle import (
     part_features,
     posed_splat,
 )
+from splatart_ns.errors import InputError
 
 D = torch.float64
 
@@ -40,11 +41,27 @@ def test_a_point_moves_as_the_joint_says(kind, pitch, value, expected):
     torch.testing.assert_close(moved, torch.tensor(expected, dtype=D))
 
 
-def test_a_value_of_the_wrong_size_is_refused():
-    with pytest.raises(ValueError, match="takes 3 values"):
-        joint_motion(joint("spherical"), 0.1)
-    with pytest.raises(ValueError, match="takes 1 values"):
-        joint_motion(joint("revolute"), [0.1])
+@pytest.mark.parametrize("kind", ["revolute", "screw", "cylindrical", "spherical", "free", "fixed"])
+def test_a_batch_of_values_gives_the_motions_one_by_one(kind):
+    dofs = {"cylindrical": [2], "spherical": [3], "free": [6]}.get(kind, [])
+    values = torch.randn(4, 3, *dofs, dtype=D, generator=torch.Generator().manual_seed(0))
+    T = joint_motion(joint(kind, 0.1), values)
+    assert T.shape == (4, 3, 4, 4)
+    torch.testing.assert_close(T[2, 1], joint_motion(joint(kind, 0.1), values[2, 1]))
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "found"),
+    [
+        ("spherical", 0.1, r"takes 3 values, not shape \[\]"),
+        ("spherical", [[0.1, 0.2]], r"takes 3 values, not shape \[1, 2\]"),
+        ("revolute", "wide", "'wide' are no numbers"),
+        ("revolute", [0.1, math.nan], "not finite"),
+    ],
+)
+def test_a_value_that_cannot_be_is_refused(kind, value, found):
+    with pytest.raises(InputError, match=found):
+        joint_motion(joint(kind), value)
 
 
 def test_observed_values_give_the_observed_motions(bundle):
@@ -72,7 +89,7 @@ def test_a_part_that_hangs_on_nothing_stays_with_the_root(bundle):
 
 
 def test_an_unknown_joint_is_refused(bundle):
-    with pytest.raises(KeyError, match="closure"):
+    with pytest.raises(InputError, match="no tree joint is called closure; there are hinge, slide"):
         posed_splat(bundle, {"closure": 0.0})
 
 

@@ -21,10 +21,10 @@ from splatart_ns.bundle import (
     observed_motions,
     part_features,
 )
+from splatart_ns.bundle.articulated_splat import predicted_parts
 from splatart_ns.bundle.surface import part_surface
 from splatart_ns.evaluation import geometry
 from splatart_ns.evaluation.ground_truth import GroundTruth, NovelState, TrueJoint
-from splatart_ns.evaluation.images import predicted_parts
 from splatart_ns.geometry.camera import viewmat_from_opengl
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats import Splat

@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from splatart_ns.bundle import configured_motions
 from splatart_ns.bundle.animation import bundle_colours, render_frames
-from splatart_ns.bundle.viewpoint import bounding_sphere, orbit_viewpoint
-from splatart_ns.capture.capture import Normalization
+from splatart_ns.bundle.articulated_splat import ArticulatedSplat
+from splatart_ns.bundle.camera import bounding_sphere, orbit_camera
 from splatart_ns.geometry.se3 import quat_from_matrix
 from splatart_ns.viewer.renderer import Eye, Renderer
 
@@ -17,58 +16,49 @@ SIZE = 96
 
 @pytest.fixture
 def view(bundle):
-    return orbit_viewpoint(*bounding_sphere(bundle, [{}]), 0.6, 0.4, SIZE, SIZE)
+    return orbit_camera(*bounding_sphere(bundle, [{}]), 0.6, 0.4, SIZE, SIZE)
 
 
 @pytest.fixture
-def normalization(bundle):
-    centre, radius = bounding_sphere(bundle, [{}])
-    return Normalization(centre, 1 / radius)
+def splat(bundle):
+    return ArticulatedSplat(bundle)
 
 
 @pytest.fixture
-def eye(view, normalization):
-    T = normalization.camera_to_normal(view.T_world_camera)
+def eye(view, splat):
+    T = splat.normalization.camera_to_normal(view.T_world_camera.numpy())
     R = torch.from_numpy(T[:3, :3] * [1, -1, -1])
-    fov = 2 * math.atan(SIZE / 2 / view.camera.K[0, 0])
+    fov = 2 * math.atan(SIZE / 2 / view.K[0, 0])
     return Eye(quat_from_matrix(R).numpy(), T[:3, 3], fov, 1.0)
 
 
-def motions(bundle, normalization, q):
-    found = configured_motions(bundle, q).items()
-    return {name: torch.from_numpy(normalization.motion_to_normal(T.numpy())) for name, T in found}
-
-
 @pytest.mark.parametrize("q", [{}, {"hinge": -0.7, "runner": 0.3}])
-def test_the_viewer_shows_what_render_writes(bundle, normalization, view, eye, q):
+def test_the_viewer_shows_what_render_writes(bundle, view, eye, q):
     lid = bundle.parts[1]
     tail = 0.3 * torch.randn(len(lid.splat), 3, 3, generator=torch.Generator().manual_seed(1))
     lid.splat = replace(lid.splat, sh=torch.cat([lid.splat.sh, tail], 1))  # its colours depend on the view
-    (expected,) = render_frames(bundle, [q], view)
-    shown = Renderer(bundle, normalization, "cpu").image(motions(bundle, normalization, q), eye, SIZE)
+    splat = ArticulatedSplat(bundle)
+    (expected,) = render_frames(splat, [q], view)
+    shown = Renderer(splat).image(q, eye, SIZE)
     difference = np.abs(shown.astype(int) - expected)
     assert difference.max() <= 3 and difference.mean() < 0.1
     assert expected.std() > 30
 
 
-def test_a_hidden_part_is_not_seen(bundle, normalization, eye):
-    renderer, still = Renderer(bundle, normalization, "cpu"), motions(bundle, normalization, {})
+def test_a_hidden_part_is_not_seen(bundle, splat, eye):
+    renderer, still = Renderer(splat), {}
     green = [np.all(renderer.image(still, eye, SIZE, hidden) == [0, 255, 0], axis=-1).sum() for hidden in ([], ["lid"])]
     assert green[0] > 200 and green[1] == 0
 
 
-def test_parts_are_shown_in_their_colours(bundle, normalization, eye):
-    image = Renderer(bundle, normalization, "cpu").image(
-        motions(bundle, normalization, {}), eye, SIZE, hidden=["base", "drawer"], by_part=True
-    )
+def test_parts_are_shown_in_their_colours(bundle, splat, eye):
+    image = Renderer(splat).image({}, eye, SIZE, hidden=["base", "drawer"], by_part=True)
     seen = image[(image != 255).any(-1)].astype(float)
     darkest = seen[seen.sum(1).argmin()]
     expected = bundle_colours(bundle)[1].numpy()
     assert darkest / np.linalg.norm(darkest) == pytest.approx(expected / np.linalg.norm(expected), abs=0.05)
 
 
-def test_without_any_part_the_image_is_white(bundle, normalization, eye):
-    image = Renderer(bundle, normalization, "cpu").image(
-        motions(bundle, normalization, {}), replace(eye, aspect=2.0), 10, bundle.part_names
-    )
+def test_without_any_part_the_image_is_white(bundle, splat, eye):
+    image = Renderer(splat).image({}, replace(eye, aspect=2.0), 10, bundle.part_names)
     assert image.shape == (10, 20, 3) and (image == 255).all()

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from viewer_client import ViewerClient, free_port
 
-from splatart_ns.bundle import save_bundle
+from splatart_ns.bundle import ArticulatedSplat, save_bundle
 from splatart_ns.errors import InputError
 from splatart_ns.viewer.viewer import Viewer
 
 
 @pytest.fixture
 def viewer(bundle):
-    viewer = Viewer(bundle, "127.0.0.1", free_port())
+    viewer = Viewer(ArticulatedSplat(bundle), "127.0.0.1", free_port())
     with ThreadPoolExecutor() as threads:
         running = threads.submit(viewer.run)
         yield viewer
@@ -147,7 +147,7 @@ def test_a_browser_that_leaves_is_not_missed(viewer, client):
 
 def test_joint_axes_go_with_the_part_that_carries_them(bundle):
     bundle.joints[1].parent = "lid"
-    viewer = Viewer(bundle, "127.0.0.1", free_port())
+    viewer = Viewer(ArticulatedSplat(bundle), "127.0.0.1", free_port())
     hinge, runner = (node for _, node in viewer.axes._nodes)
     viewer.panel.sliders[0].value = -90.0
     viewer.axes.move(viewer._motions())
@@ -162,7 +162,7 @@ def test_a_port_in_use_is_refused_with_a_way_out(bundle):
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(InputError, match=f"127.0.0.1, port {port} cannot be opened .*--port"):
-            Viewer(bundle, "127.0.0.1", port)
+            Viewer(ArticulatedSplat(bundle), "127.0.0.1", port)
 
 
 @pytest.mark.parametrize(("option", "value"), [("--port", 0), ("--port", 70000), ("--host", "203.0.113.1")])

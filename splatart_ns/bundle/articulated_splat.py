@@ -1,0 +1,185 @@
+"""An object of Gaussians with joints, to be posed and rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from splatart_ns.bundle.bundle import Bundle, Joint
+from splatart_ns.bundle.camera import Camera, bounding_sphere
+from splatart_ns.bundle.configurations import movable_joints
+from splatart_ns.bundle.folder import load_bundle
+from splatart_ns.bundle.posing import (
+    JointValue,
+    configured_motions,
+    moved_splat,
+    normalized,
+    observed_values,
+    part_features,
+)
+from splatart_ns.capture.capture import Normalization
+from splatart_ns.errors import InputError
+from splatart_ns.geometry.camera import viewmat_from_opengl
+from splatart_ns.rasterize.render import Rendering, render
+
+_AT_REST: Mapping[str, JointValue] = {}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What cameras see; without the leading dimension where neither cameras nor configurations are batched."""
+
+    rgb: Tensor
+    """Colours over black [B, H, W, 3], 0 to 1: multiplied by alpha. Strong lights may exceed 1 a little."""
+    alpha: Tensor
+    """How much of each pixel the object covers [B, H, W], 0 to 1."""
+    depth: Tensor | None
+    """Along the optical axis [B, H, W], in the bundle's unit; 0 where nothing is seen. None if not asked for."""
+    part_shares: Tensor | None
+    """How much of each pixel each part covers [B, H, W, P]; their sum is alpha. None if not asked for."""
+    ids: Tensor
+    """The parts' label ids [P]."""
+
+    def over(self, background: Tensor) -> Tensor:
+        """Colours [B, H, W, 3] before a background [3] or an image [B, H, W, 3], clamped to 0..1."""
+        return (self.rgb + (1 - self.alpha[..., None]) * background.to(self.rgb)).clamp(0, 1)
+
+    @property
+    def part_ids(self) -> Tensor:
+        """The label id of the part that covers most of each pixel [B, H, W], int64; 0 where most is background."""
+        if self.part_shares is None:
+            raise InputError("the picture has no part labels; render it with labels=True")
+        return predicted_parts(self.alpha[..., None], self.part_shares, self.ids)
+
+
+def predicted_parts(accumulation: Tensor, features: Tensor, ids: Tensor) -> Tensor:
+    """The likeliest part id [..., H, W] of rendered accumulation [..., H, W, 1] and part shares [..., H, W, P].
+
+    `ids` [P] are the ids of the parts; 0 where most is background.
+    """
+    shares = torch.cat([1 - accumulation, features], dim=-1)
+    return torch.cat([ids.new_zeros(1), ids])[shares.argmax(-1)]
+
+
+class ArticulatedSplat:
+    """A bundle in any configuration.
+
+    A configuration `q` gives joints by name their values, as numbers, lists, arrays or tensors: radians or lengths,
+    0 where state 0 has the joint, [] or [B] for a joint of one freedom, [D] or [B, D] for one of D (`Joint.values`
+    tells their order). Joints that it does not name are at 0. Values beyond the observed limits are taken.
+    """
+
+    def __init__(self, bundle: Bundle, device: torch.device | str | None = None):
+        """`device`: where images are made; CUDA where there is any by default."""
+        self.bundle = bundle
+        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        parts = [replace(part, splat=part.splat.to(self.device)) for part in bundle.parts]
+        self._on_device = replace(bundle, parts=parts)
+        self._one_hot = part_features(bundle).to(self.device)
+        self.centre, self.radius = bounding_sphere(
+            bundle, [observed_values(bundle, s) for s in range(len(bundle.states))]
+        )
+        """Of a sphere about the object in the observed states: [3] in the canonical frame, and a length."""
+        self.normalization = Normalization(self.centre, 1 / self.radius)
+        """Brings the object to a radius of 1 about the origin, to render it: the near plane is a fixed length."""
+
+    @property
+    def joints(self) -> dict[str, Joint]:
+        """The joints that can be moved, by name, parents before children."""
+        return movable_joints(self.bundle)
+
+    @property
+    def part_names(self) -> list[str]:
+        """In order of the parts' ids, as in `Picture.part_shares`."""
+        return self.bundle.part_names
+
+    def link_poses(self, q: Mapping[str, JointValue] = _AT_REST) -> dict[str, Tensor]:
+        """T_world_link [4, 4], or [B, 4, 4] for a batch, float64, of each part by name.
+
+        It moves the part's points from the canonical frame (the world at state 0, where its Gaussians are stored) to
+        where they are in the configuration. The root stays. Differentiable in `q`.
+
+        Raises:
+            InputError: an unknown joint, values of a wrong shape or not finite, batches of different sizes.
+        """
+        return configured_motions(self.bundle, q)
+
+    def render(
+        self,
+        camera: Camera,
+        q: Mapping[str, JointValue] = _AT_REST,
+        *,
+        parts: Collection[str] | None = None,
+        depth: bool = True,
+        labels: bool = True,
+    ) -> Picture:
+        """What the camera sees in a configuration, float32 on `device`; differentiable in `q`.
+
+        Args:
+            camera: One, or a batch of B.
+            q: One configuration, or a batch of B; two batches go in pairs.
+            parts: Names of those that are rendered; all by default.
+            depth, labels: Whether to render them; without, it is faster.
+
+        Raises:
+            InputError: as `link_poses`; an unknown part.
+        """
+        shown = self._shown(parts)
+        motions = self.link_poses(q)
+        posed = motions[self.bundle.root].shape[:-2]
+        if len(posed) > 1 or len({*posed, *camera.batch} - {1}) > 1:
+            found = f"configurations {list(posed)} and cameras {list(camera.batch)}"
+            raise InputError(f"the batches of {found} do not go together; give B of both, or B of one")
+
+        def seen(motions: Mapping[str, Tensor], viewmats: Tensor, Ks: Tensor) -> Rendering:
+            splat = normalized(moved_splat(self._on_device, motions), self.normalization).select(shown)
+            one_hot = self._one_hot[shown] if labels else None
+            size = camera.width, camera.height
+            return render(splat, viewmats, Ks, *size, features=one_hot, with_depth=depth)
+
+        batch = torch.broadcast_shapes(posed, camera.batch)
+        viewmats, Ks = (x.expand(*(batch or (1,)), *x.shape[-2:]) for x in self._tensors(camera))
+        if posed:
+            motions = {name: T.expand(*batch, 4, 4) for name, T in motions.items()}
+            each = [
+                seen({name: T[i] for name, T in motions.items()}, viewmats[i, None], Ks[i, None])
+                for i in range(batch[0])
+            ]
+        else:
+            each = [seen(motions, viewmats, Ks)]
+        return self._picture(each, batch)
+
+    def _shown(self, parts: Collection[str] | None) -> Tensor:
+        """Which Gaussians [N] belong to these parts."""
+        names = self.part_names
+        wanted = set(names if parts is None else parts)
+        if unknown := wanted - set(names):
+            raise InputError(f"no part is called {', '.join(sorted(map(str, unknown)))}; there are {', '.join(names)}")
+        return self._one_hot @ torch.tensor([float(name in wanted) for name in names], device=self.device) > 0
+
+    def _tensors(self, camera: Camera) -> tuple[Tensor, Tensor]:
+        T = torch.from_numpy(self.normalization.camera_to_normal(camera.T_world_camera.numpy()))
+        return viewmat_from_opengl(T).float().to(self.device), camera.K.float().to(self.device)
+
+    def _picture(self, each: list[Rendering], batch: tuple[int, ...]) -> Picture:
+        def joined(images: list[Tensor]) -> Tensor:
+            image = torch.cat(images)
+            return image if batch else image[0]
+
+        first = each[0]
+        return Picture(
+            rgb=joined([r.rgb for r in each]),
+            alpha=joined([r.accumulation[..., 0] for r in each]),
+            depth=None if first.depth is None else joined([r.depth[..., 0] for r in each]) * self.radius,
+            part_shares=None if first.features is None else joined([r.features for r in each]),
+            ids=torch.tensor([part.id for part in self.bundle.parts], device=self.device),
+        )
+
+
+def load(folder: Path | str, device: torch.device | str | None = None) -> ArticulatedSplat:
+    """The object in a bundle's folder. Raises InputError where that cannot be read."""
+    return ArticulatedSplat(load_bundle(Path(folder)), device)
