@@ -16,6 +16,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import tyro
 from rich.console import Console
+from rich.progress import track
 
 from splatart_ns.capture.procedural import OBJECTS
 from splatart_ns.capture.synthesis import SynthesisOptions
@@ -59,6 +60,10 @@ def render(
     set: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction] = (),
     sweep: bool = False,
     trajectory: Path | None = None,
+    dataset: int | None = None,
+    states: int = 2,
+    views: Literal["sphere", "hemisphere"] = "sphere",
+    seed: int = 0,
     channel: Literal["rgb", "depth", "accumulation", "parts"] = "rgb",
     frames: int = 60,
     fps: float = 30.0,
@@ -70,15 +75,20 @@ def render(
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
     rasterizer: Rasterizer = "auto",
 ) -> None:
-    """Render a bundle in one configuration, in a sweep of each joint, or along a trajectory.
+    """Render a bundle in one configuration, in a sweep of each joint, along a trajectory, or as a labelled dataset.
 
     Args:
         bundle: Folder that `splatart fit` left.
-        output: A folder for PNG frames, or a .gif or .mp4 file.
+        output: A folder for PNG frames or a dataset, or a .gif or .mp4 file.
         set: Joint values, joint=value: radians, or degrees as 30deg, or a length; joints of several freedoms take as
             many, lengths first: ball=10deg,0,5deg. Joints not named are as in state 0.
         sweep: Move one joint after the other over its observed range.
         trajectory: CSV file: a header of joint names, and a row of values a frame.
+        dataset: Write a capture with ground truth: so many images with part labels and depth at random views and
+            configurations. Run it again to go on, or with more to add some.
+        states: Configurations of the dataset, each within the observed ranges; the images are dealt out to them.
+        views: See the object of the dataset from everywhere, or from above only.
+        seed: Seed of the dataset.
         channel: What to show.
         frames: Frames of each joint's sweep.
         fps: Frames per second of a film.
@@ -92,6 +102,8 @@ def render(
     """
     from splatart_ns.bundle import animation, configurations, load
     from splatart_ns.bundle import camera as cameras
+    from splatart_ns.bundle.dataset import Dataset, DatasetOptions
+    from splatart_ns.bundle.dataset_capture import write_dataset
     from splatart_ns.capture.formats import load_capture
 
     if sweep and trajectory is not None:
@@ -99,6 +111,17 @@ def render(
     _check_numbers(frames, fps, resolution, azimuth, elevation, background)
     _choose_rasterizer(rasterizer)
     splat = load(bundle)
+    if dataset is not None:
+        if set or sweep or trajectory is not None or data is not None:
+            raise InputError(
+                "--dataset chooses configurations and views; leave out --set, --sweep, --trajectory and --data."
+            )
+        samples = Dataset(splat, DatasetOptions(states, resolution, views, seed))
+        told = write_dataset(samples, output, dataset, lambda missing: track(missing, "Images", console=CONSOLE))
+        if not told:
+            CONSOLE.print("note: no ground_truth.json, which cannot tell screws and joints of several freedoms")
+        CONSOLE.print(f"Capture: {output}")
+        return
     base = configurations.parse_settings(sum(set, ()), splat.bundle)
     if trajectory is not None:
         path = [base | q for q in configurations.read_trajectory(trajectory, splat.bundle)]

@@ -192,6 +192,21 @@ def test_render_looks_through_a_camera_of_the_capture(render, hinge_capture, tmp
     assert -10 * np.log10(((shown - true) ** 2).mean() / 255**2) > 18
 
 
+def test_a_dataset_is_a_capture_without_problems(run_main, hinge_fit, tmp_path):
+    folder = tmp_path / "capture"
+    code, output, errors = run_main("render", hinge_fit, "--dataset", 24, "--states", 3, "--output", folder, *SMALL)
+    assert (code, errors) == (0, "") and f"Capture: {folder}" in output
+    assert [len(state.frames) for state in load_capture(folder).states] == [8, 8, 8]
+    code, output, _ = run_main("check", folder)
+    assert code == 0 and "0 errors, 0 warnings" in output
+
+
+def test_a_dataset_chooses_its_own_configurations(run_main, hinge_fit, tmp_path):
+    arguments = "--dataset", 9, "--output", tmp_path / "capture"
+    code, _, errors = run_main("render", hinge_fit, *arguments, "--set", f"{JOINT}=0.1")
+    assert code == 2 and "leave out --set" in errors and not (tmp_path / "capture").exists()
+
+
 @pytest.mark.parametrize("channel", ["depth", "accumulation", "parts"])
 def test_render_shows_other_channels(render, tmp_path, channel):
     arguments = ("--channel", channel, "--background", 0, 0, 0)

@@ -1,0 +1,116 @@
+"""Labelled images of an object at random views and configurations, each made from its number alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+
+from splatart_ns.bundle.articulated_splat import ArticulatedSplat, Picture
+from splatart_ns.bundle.camera import Camera, bounding_sphere, orbit_camera
+from splatart_ns.bundle.configurations import Configuration
+from splatart_ns.errors import InputError
+
+_PLASTIC = 1.32471795724474602596
+"""The root of x^3 = x + 1: multiples of 1/x and 1/x^2 cover a square evenly, however many there are (M. Roberts, The
+Unreasonable Effectiveness of Quasirandom Sequences, 2018)."""
+_SIZED_BY = 256
+"""So many configurations say how large the object is."""
+
+
+@dataclass(frozen=True)
+class DatasetOptions:
+    """What images are made."""
+
+    states: int = 2
+    """How many configurations. Image i shows state i % states."""
+    resolution: int = 256
+    """Pixels along each side."""
+    views: Literal["sphere", "hemisphere"] = "sphere"
+    """See the object from everywhere, or from above (+z) only."""
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One labelled image."""
+
+    index: int
+    state: int
+    q: Configuration
+    camera: Camera
+    rgba: np.ndarray
+    """uint8 [H, W, 4], straight colours."""
+    labels: np.ndarray
+    """uint8 [H, W]: 0 background, else part ids."""
+    depth: np.ndarray
+    """float32 [H, W] along the optical axis, in the bundle's unit; 0 where nothing is seen."""
+
+
+class Dataset:
+    """Samples by number, 0 and up without end: the same object, options and number give the same sample.
+
+    Every joint's observed range is cut into as many pieces as there are states, and each state has a value from another
+    piece, so that few states differ and many cover the range (a Latin hypercube). A joint's freedoms are drawn apart.
+    """
+
+    def __init__(self, splat: ArticulatedSplat, options: DatasetOptions | None = None):
+        """Raises InputError for options that make no sense."""
+        self.splat, self.options = splat, options or DatasetOptions()
+        for name, least in (("states", 1), ("resolution", 8), ("seed", 0)):
+            if (value := getattr(self.options, name)) < least:
+                raise InputError(f"--{name} is {value}; give {least} or more")
+        some = [self.configuration(state) for state in range(min(self.options.states, _SIZED_BY))]
+        self.centre, self.radius = bounding_sphere(splat.bundle, some)
+        """Of a sphere about the object in all states, which every image shows whole."""
+
+    def configuration(self, state: int) -> Configuration:
+        """The joint values of a state, from 0."""
+        q: Configuration = {}
+        states = self.options.states
+        for number, (name, joint) in enumerate(self.splat.joints.items()):
+            rng = np.random.default_rng([self.options.seed, 0, number])
+            observed = joint.values.reshape(len(joint.values), -1).numpy()
+            low, high = observed.min(0), observed.max(0)
+            places = np.stack([rng.permutation(states) for _ in low], -1) + rng.uniform(size=(states, len(low)))
+            values = (low + (high - low) * places[state] / states).tolist()
+            q[name] = values if len(values) > 1 else values[0]
+        return q
+
+    def camera(self, index: int) -> Camera:
+        """Where image `index` is taken from; the images of a state lie evenly around the object."""
+        state, number = index % self.options.states, index // self.options.states
+        start = np.random.default_rng([self.options.seed, 1, state]).uniform(size=2)
+        height, turn = (start + (number + 1) / np.array([_PLASTIC, _PLASTIC**2])) % 1
+        z = height if self.options.views == "hemisphere" else 1 - 2 * height
+        size = self.options.resolution
+        return orbit_camera(self.centre, self.radius, 2 * math.pi * turn, math.asin(z), size, size)
+
+    def __getitem__(self, index: int) -> Sample:
+        state = index % self.options.states
+        q, camera = self.configuration(state), self.camera(index)
+        picture = self.splat.render(camera, q)
+        return Sample(
+            index,
+            state,
+            q,
+            camera,
+            rgba=_rgba(picture),
+            labels=picture.part_ids.byte().cpu().numpy(),
+            depth=picture.depth.cpu().numpy(),
+        )
+
+    def samples(self, count: int, first: int = 0) -> Iterator[Sample]:
+        """The samples `first` to `first + count - 1`."""
+        for index in range(first, first + count):
+            yield self[index]
+
+
+def _rgba(picture: Picture) -> np.ndarray:
+    alpha = picture.alpha[..., None].clamp(0, 1)
+    straight = (picture.rgb / alpha.clamp_min(1e-6)).clamp(0, 1) * (alpha > 0)
+    return (255 * torch.cat([straight, alpha], -1)).round().byte().cpu().numpy()
