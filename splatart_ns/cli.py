@@ -57,6 +57,7 @@ def fit(
 def render(
     bundle: Annotated[Path, tyro.conf.Positional],
     output: Path,
+    configuration: Path | None = None,
     set: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction] = (),
     sweep: bool = False,
     trajectory: Path | None = None,
@@ -80,6 +81,7 @@ def render(
     Args:
         bundle: Folder that `splatart fit` left.
         output: A folder for PNG frames or a dataset, or a .gif or .mp4 file.
+        configuration: JSON file of joint values, as the viewer saves it; --set changes single ones.
         set: Joint values, joint=value: radians, or degrees as 30deg, or a length; joints of several freedoms take as
             many, lengths first: ball=10deg,0,5deg. Joints not named are as in state 0.
         sweep: Move one joint after the other over its observed range.
@@ -112,17 +114,17 @@ def render(
     _choose_rasterizer(rasterizer)
     splat = load(bundle)
     if dataset is not None:
-        if set or sweep or trajectory is not None or data is not None:
-            raise InputError(
-                "--dataset chooses configurations and views; leave out --set, --sweep, --trajectory and --data."
-            )
+        if set or sweep or not (configuration is trajectory is data is None):
+            rivals = "--configuration, --set, --sweep, --trajectory and --data"
+            raise InputError(f"--dataset chooses what it shows; leave out {rivals}.")
         samples = Dataset(splat, DatasetOptions(states, resolution, views, seed))
         told = write_dataset(samples, output, dataset, lambda missing: track(missing, "Images", console=CONSOLE))
         if not told:
             CONSOLE.print("note: no ground_truth.json, which cannot tell screws and joints of several freedoms")
         CONSOLE.print(f"Capture: {output}")
         return
-    base = configurations.parse_settings(sum(set, ()), splat.bundle)
+    base = configurations.read_configuration(configuration, splat.bundle) if configuration is not None else {}
+    base |= configurations.parse_settings(sum(set, ()), splat.bundle)
     if trajectory is not None:
         path = [base | q for q in configurations.read_trajectory(trajectory, splat.bundle)]
     else:

@@ -145,6 +145,19 @@ def test_every_set_counts(run_main, hinge_fit, tmp_path):
     assert code == 2 and "'nothing'" in errors
 
 
+def test_a_saved_configuration_is_shown_and_set_changes_it(render, tmp_path):
+    file = tmp_path / "configuration.json"
+    file.write_text(json.dumps({JOINT: 0.7}))
+
+    def shown(folder, *arguments):
+        return picture(render(tmp_path / folder, "--azimuth", 60, *arguments) / "frame_0000.png")
+
+    saved = shown("saved", "--configuration", file)
+    assert (saved == shown("set", "--set", f"{JOINT}=0.7")).all()
+    changed = shown("changed", "--configuration", file, "--set", f"{JOINT}=0")
+    assert np.abs(changed - saved).mean() > 2 and (changed == shown("rest")).all()
+
+
 def test_a_sweep_moves_the_joint_there_and_back(render, tmp_path):
     folder = render(tmp_path / "frames", "--sweep", "--frames", 6)
     frames = [picture(folder / f"frame_{i:04d}.png") for i in range(6)]
@@ -204,7 +217,7 @@ def test_a_dataset_is_a_capture_without_problems(run_main, hinge_fit, tmp_path):
 def test_a_dataset_chooses_its_own_configurations(run_main, hinge_fit, tmp_path):
     arguments = "--dataset", 9, "--output", tmp_path / "capture"
     code, _, errors = run_main("render", hinge_fit, *arguments, "--set", f"{JOINT}=0.1")
-    assert code == 2 and "leave out --set" in errors and not (tmp_path / "capture").exists()
+    assert code == 2 and "leave out --configuration, --set," in errors and not (tmp_path / "capture").exists()
 
 
 @pytest.mark.parametrize("channel", ["depth", "accumulation", "parts"])

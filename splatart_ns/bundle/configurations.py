@@ -1,4 +1,4 @@
-"""Joint values for rendering: what a person types, sweeps over the observed range, trajectories from CSV files."""
+"""Joint values for rendering: what a person types or saved, sweeps over the observed range, trajectories in files."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
 from splatart_ns.errors import InputError
+from splatart_ns.records import read_record
 
 Configuration = dict[str, float | list[float]]
 """Joint name to value, radian or length, or to as many as the joint has freedoms (`Joint.values`); joints that are not
@@ -65,6 +66,16 @@ def _parse_number(number: str, joint: Joint, is_length: bool, where: str) -> flo
     if not math.isfinite(value):
         raise InputError(f"{where}: '{number}' for joint '{joint.name}' is no number; write 0.5 or 30deg")
     return math.radians(value) if degrees else value
+
+
+def read_configuration(path: Path, bundle: Bundle) -> Configuration:
+    """A configuration from a JSON file `{joint: value, or [values]}`, radians and lengths, as the viewer saves it."""
+    record = read_record(Path(path), "give a JSON file of joint names and values, as `splatart view` saves it")
+    configuration: Configuration = {}
+    for name, value in record.fields.items():
+        dofs = JOINT_DOFS[_find(name, bundle, f"{path}").type]
+        configuration[name] = record.numbers(name, value, (dofs,) if dofs > 1 else ()).tolist()
+    return configuration
 
 
 def sweep(bundle: Bundle, base: Mapping[str, float | list[float]], frames_per_joint: int) -> list[Configuration]:

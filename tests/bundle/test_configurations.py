@@ -1,9 +1,10 @@
+import json
 import math
 
 import pytest
 
 from splatart_ns.bundle import configured_motions
-from splatart_ns.bundle.configurations import movable_joints, parse_settings, read_trajectory, sweep
+from splatart_ns.bundle.configurations import movable_joints, parse_settings, read_configuration, read_trajectory, sweep
 from splatart_ns.errors import InputError
 
 
@@ -124,3 +125,31 @@ def test_a_trajectory_that_cannot_be_used_says_why(bundle, tmp_path, text, messa
 def test_a_missing_trajectory_is_named(bundle, tmp_path):
     with pytest.raises(InputError, match="none.csv"):
         read_trajectory(tmp_path / "none.csv", bundle)
+
+
+def test_a_saved_configuration_is_read(with_ball, tmp_path):
+    path = tmp_path / "q.json"
+    saved = {"closure": [0.1, 0.2, -0.3], "hinge": 9}  # beyond the limits
+    path.write_text(json.dumps(saved))
+    assert read_configuration(path, with_ball) == saved
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"door": 1}', "q.json: no movable joint is called 'door'; there are hinge, closure"),
+        ('{"hinge": [1]}', "'hinge' of the file holds .*shape"),
+        ('{"hinge": "30deg"}', "'hinge' of the file holds"),
+        ('{"hinge": NaN}', "NaN is no number"),
+        ('{"closure": [1, 2]}', "'closure' of the file holds"),
+        ("[1]", "must be an object"),
+        ("hinge=1", "is not JSON"),
+    ],
+)
+def test_a_saved_configuration_that_cannot_be_used_says_why(with_ball, tmp_path, text, message):
+    path = tmp_path / "q.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_configuration(path, with_ball)
+    with pytest.raises(InputError, match="none.json: cannot be read .*`splatart view` saves"):
+        read_configuration(tmp_path / "none.json", with_ball)
