@@ -14,6 +14,7 @@ from splatart_ns.bundle.sliders import bundle_sliders, configuration, positions
 
 _LINE = 36
 """Characters of a line of the tree, at most."""
+_HOW_TO_SELECT = "Click at a part to select it."
 
 
 class Panel:
@@ -38,11 +39,14 @@ class Panel:
             self.reset = gui.add_button("Reset", hint="All joints as in state 0")
             self.sweep = gui.add_checkbox("Sweep", False, hint="One joint after the other over what was observed")
         self.parts: dict[str, viser.GuiInputHandle[bool]] = {}
+        self._told = {name: "hangs on nothing" for name in bundle.part_names} | {bundle.root: "the root"}
+        self._told |= {name: describe_joint(joint) for name, joint in joints.items()}
+        self._selected: str | None = None
         with gui.add_folder("Parts"):
             gui.add_markdown(f"```\n{tree_text(bundle)}\n```")
+            self._selection = gui.add_markdown(_HOW_TO_SELECT)
             for name, _ in part_depths(bundle):
-                hint = describe_joint(joints[name]) if name in joints else "hangs on nothing"
-                self.parts[name] = gui.add_checkbox(_breakable(name), True, hint=hint)
+                self.parts[name] = gui.add_checkbox(_breakable(name), True, hint=self._told[name])
         with gui.add_folder("Show"):
             self.by_part = gui.add_checkbox("Part colours", False)
             self.axes = gui.add_checkbox("Joint axes", True, hint="Thicker by two standard deviations")
@@ -63,6 +67,17 @@ class Panel:
             position = round(min(max(position, limits.low), limits.high), 9)  # 30, and not 29.999999999999996
             if abs(position - slider.value) > 1e-3 * limits.step:
                 slider.value = position
+
+    @property
+    def selected(self) -> str | None:
+        """The part that stands out, whose joint is told; None for none."""
+        return self._selected
+
+    @selected.setter
+    def selected(self, name: str | None) -> None:
+        self._selected = name
+        text = _HOW_TO_SELECT if name is None else f"**{_plain(name)}**: {_plain(self._told[name])}"
+        self._selection.content = text
 
     @property
     def hidden(self) -> set[str]:
@@ -86,10 +101,7 @@ def part_depths(bundle: Bundle) -> list[tuple[str, int]]:
 
 def tree_text(bundle: Bundle) -> str:
     """A line a part, indented under what it hangs on. Nothing in a name can end a block of code."""
-    lines = [
-        max(depth - 1, 0) * " " + ("└ " if depth else "") + re.sub(r"[^\w .:+-]", "?", name)
-        for name, depth in part_depths(bundle)
-    ]
+    lines = [max(depth - 1, 0) * " " + ("└ " if depth else "") + _plain(name) for name, depth in part_depths(bundle)]
     # A longer line would make the panel wider than the browser shows it.
     return "\n".join(line if len(line) <= _LINE else line[: _LINE - 1] + "…" for line in lines)
 
@@ -99,6 +111,11 @@ def describe_joint(joint: Joint) -> str:
     text = f"{joint.type} on {joint.parent}"
     deviation = direction_deviation(joint)
     return text if deviation is None else f"{text}, axis ± {math.degrees(deviation):.2g} degree"
+
+
+def _plain(text: str) -> str:
+    """Without what has a meaning in Markdown or HTML, but for underscores, which have none within words."""
+    return re.sub(r"[^\w .,:+±-]", "?", text)
 
 
 def _breakable(label: str) -> str:

@@ -14,6 +14,7 @@ from itertools import cycle
 
 import numpy as np
 import torch
+import trimesh
 import viser
 from PIL import Image
 from torch import Tensor
@@ -39,6 +40,8 @@ _FRAME_SECONDS = 1 / 20
 _IDLE_SECONDS = 1.0
 _MAX_ASPECT = 4.0
 _FIELD_OF_VIEW = math.radians(35)
+_BACKDROP = 100.0
+"""Radius, in radii of the object."""
 _AZIMUTH, _ELEVATION = math.radians(40), math.radians(25)
 """Where a browser starts: beside the object's front, and above it."""
 
@@ -57,6 +60,7 @@ class Viewer:
         self.server = viser.ViserServer(host, port, label=self._bundle.root, verbose=False)
         self.axes = Axes(self.server, self._bundle, splat.normalization)
         self.panel = Panel(self.server, self._bundle)
+        self._backdrop = add_backdrop(self.server)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._is_due = False
         """Whether an image of what moved is asked for already."""
@@ -105,6 +109,7 @@ class Viewer:
             slider.on_update(self._take_over)
         for switch in (*panel.parts.values(), panel.by_part, panel.axes):
             switch.on_update(lambda _: self._changed())
+        self._backdrop.on_click(lambda event: jobs.put(lambda: self._select(event)))
         panel.reset.on_click(lambda _: jobs.put(self._reset))
         panel.sweep.on_update(lambda _: jobs.put(self._start_or_stop_sweep))
         panel.save_configuration.on_click(lambda event: jobs.put(lambda: self._save_configuration(event.client)))
@@ -151,10 +156,14 @@ class Viewer:
             client.scene.set_background_image(self._image(client, rows), "jpeg", jpeg_quality=85)
 
     def _image(self, client: viser.ClientHandle, rows: int) -> np.ndarray:
-        camera, panel = client.camera, self.panel
-        aspect = min(max(camera.aspect, 1 / _MAX_ASPECT), _MAX_ASPECT)
-        eye = Eye(camera.wxyz, camera.position, camera.fov, aspect)
-        return self._renderer.image(panel.q, eye, rows, panel.hidden, panel.by_part.value)
+        panel = self.panel
+        return self._renderer.image(panel.q, _eye(client), rows, panel.hidden, panel.by_part.value, panel.selected)
+
+    def _select(self, event: viser.SceneNodePointerEvent) -> None:
+        """What was clicked at stands out; the background, or the same part once more, ends that."""
+        part = self._renderer.part_at(self.panel.q, _eye(event.client), event.screen_pos, self.panel.hidden)
+        self.panel.selected = None if part == self.panel.selected else part
+        self._changed()
 
     def _motions(self) -> dict[str, Tensor]:
         """T[part] [4, 4] of the normalised world, as the sliders say."""
@@ -177,6 +186,22 @@ class Viewer:
         file = io.BytesIO()
         Image.fromarray(self._image(client, _ROWS)).save(file, "PNG")
         _send(client, "picture.png", file.getvalue())
+
+
+def _eye(client: viser.ClientHandle) -> Eye:
+    camera = client.camera
+    aspect = min(max(camera.aspect, 1 / _MAX_ASPECT), _MAX_ASPECT)
+    return Eye(camera.wxyz, camera.position, camera.fov, aspect)
+
+
+def add_backdrop(server: viser.ViserServer) -> viser.MeshHandle:
+    """A sphere about everything that hears clicks anywhere and is not seen.
+
+    viser's own clicks into the scene (`on_pointer_event`) stop the mouse from turning the view. Its faces look inwards,
+    so that the outline which viser gives a mesh under the mouse lies on their backs.
+    """
+    sphere = trimesh.creation.icosphere(subdivisions=2, radius=_BACKDROP)
+    return server.scene.add_mesh_simple("/backdrop", sphere.vertices, sphere.faces[:, ::-1], opacity=0.0, side="front")
 
 
 def _send(client: viser.ClientHandle, name: str, content: bytes) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from selenium.webdriver import ActionChains as ActionChains
 from selenium.webdriver import Chrome, ChromeOptions, ChromeService
 from selenium.webdriver.common.by import By as By
 from selenium.webdriver.common.keys import Keys as Keys

@@ -12,7 +12,7 @@ from viewer_client import free_port
 from splatart_ns.bundle import save_bundle
 
 pytest.importorskip("selenium", reason="selenium is not installed: pip install 'splatart-ns[dev]'")
-from browser import BROWSER, DRIVER, By, Keys, headless_chromium
+from browser import BROWSER, DRIVER, ActionChains, By, Keys, headless_chromium
 
 VISERS_OWN = (
     "googletagmanager.com",  # asked for by its page; there may be no network
@@ -70,6 +70,13 @@ def shown(page):
     return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[:, :650].astype(int)
 
 
+def select_part(page, place):
+    """Click at a place of the page, x and y in pixels."""
+    actions = ActionChains(page)
+    actions.w3c_actions.pointer_action.move_to_location(*place).click()
+    actions.perform()
+
+
 def pixels(image, channel):
     """How many pixels have this colour, blue, green or red."""
     return int((image[..., channel] - np.delete(image, channel, axis=2).max(-1) > 100).sum())
@@ -84,6 +91,19 @@ def test_a_slider_moves_its_part_and_nothing_goes_wrong(page, tmp_path):
 
     sliders(page)[0].send_keys(Keys.HOME)
     wait_until(lambda: (np.abs(shown(page) - before).max(-1) > 100).sum() > 1000, "the lid's motion")
+
+    at_rest = shown(page)
+    rows, columns = np.nonzero(at_rest[..., 1] - np.delete(at_rest, 1, axis=2).max(-1) > 100)  # the lid
+    place = int(np.median(columns)), int(np.median(rows))
+    select_part(page, place)
+    wait_until(lambda: "lid: revolute on base" in page.find_element(By.TAG_NAME, "body").text, "the lid's joint")
+    wait_until(lambda: pixels(shown(page), 2) < 100 < pixels(shown(page), 1), "the base faded and the lid not")
+    before = shown(page)
+    ActionChains(page).move_by_offset(0, 0).click_and_hold().move_by_offset(120, 0).release().perform()
+    wait_until(lambda: (np.abs(shown(page) - before).max(-1) > 100).sum() > 1000, "the view turned by a drag")
+    assert "lid: revolute on base" in page.find_element(By.TAG_NAME, "body").text
+    select_part(page, (15, 500))
+    wait_until(lambda: pixels(shown(page), 2) > 300, "the base again, after a click beside the object")
 
     switch = page.find_element(By.XPATH, "//label[contains(., 'lid')]/following::input[@type='checkbox']")
     page.execute_script("arguments[0].click()", switch)

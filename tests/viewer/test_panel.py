@@ -63,3 +63,13 @@ def test_a_joint_says_how_certain_its_axis_is(bundle):
     hinge, runner = bundle.joints
     assert describe_joint(hinge) == "revolute on base, axis ± 0.57 degree"
     assert describe_joint(runner) == "prismatic on base"
+
+
+def test_the_selected_part_is_told_with_its_joint(panel):
+    assert panel.selected is None and "Click" in panel._selection.content
+    panel.selected = "lid"
+    assert panel._selection.content.startswith("**lid**: revolute on base, axis ± ")
+    panel.selected = "base"
+    assert panel._selection.content == "**base**: the root"
+    panel.selected = None
+    assert "Click" in panel._selection.content

@@ -62,3 +62,27 @@ def test_parts_are_shown_in_their_colours(bundle, splat, eye):
 def test_without_any_part_the_image_is_white(bundle, splat, eye):
     image = Renderer(splat).image({}, replace(eye, aspect=2.0), 10, bundle.part_names)
     assert image.shape == (10, 20, 3) and (image == 255).all()
+
+
+def test_a_selected_part_stands_out(splat, eye):
+    renderer = Renderer(splat)
+    for by_part in (False, True):
+        plain, selected = (renderer.image({}, eye, SIZE, (), by_part, name).astype(int) for name in (None, "lid"))
+        lid = np.abs(plain - renderer.image({}, eye, SIZE, ["lid"], by_part)).max(-1) > 100
+        base = (plain.min(-1) < 150) & ~lid
+        assert lid.sum() > 100 and base.sum() > 100
+        assert np.abs(selected - plain)[lid].mean() < 25 and (selected - plain)[base].min(-1).mean() > -1
+        assert (selected - plain)[base].max(-1).mean() > 80
+
+
+@pytest.mark.parametrize("q", [{}, {"hinge": -0.7, "runner": 0.3}])
+def test_the_part_at_a_place_is_the_one_that_is_shown_there(splat, view, eye, q):
+    renderer = Renderer(splat)
+    picture = splat.render(view, q)
+    inside = (picture.part_shares.max(-1).values > 0.95) | (picture.alpha < 0.02)
+    places = inside.nonzero()[:: int(inside.sum()) // 40]
+    names = {0: None} | {part.id: part.name for part in splat.bundle.parts}
+    expected = [names[int(picture.part_ids[row, column])] for row, column in places]
+    found = [renderer.part_at(q, eye, ((column + 0.5) / SIZE, (row + 0.5) / SIZE)) for row, column in places.tolist()]
+    assert found == expected and set(found) == {None, "base", "lid", "drawer"}
+    assert renderer.part_at(q, eye, (0.5, 0.5), hidden=splat.part_names) is None

@@ -1,6 +1,5 @@
 """The viewer as a browser hears it, without a browser."""
 
-import json
 import math
 import socket
 import time
@@ -12,6 +11,7 @@ import pytest
 from viewer_client import ViewerClient, free_port
 
 from splatart_ns.bundle import ArticulatedSplat, save_bundle
+from splatart_ns.bundle.configurations import read_configuration
 from splatart_ns.errors import InputError
 from splatart_ns.viewer.viewer import Viewer
 
@@ -65,7 +65,7 @@ def download(client):
     return start["filename"], part["content"]
 
 
-def test_a_moved_slider_changes_the_image_and_goes_into_the_file(viewer, client):
+def test_a_moved_slider_changes_the_image_and_goes_into_the_file(viewer, client, bundle, tmp_path):
     before, start = rest_image(client), len(client.messages)
     client.move(client.slider("hinge (degree)"), -60.0)
     after = rest_image(client, start)
@@ -74,7 +74,8 @@ def test_a_moved_slider_changes_the_image_and_goes_into_the_file(viewer, client)
     click(client, "Configuration (JSON)")
     name, content = download(client)
     assert name == "configuration.json"
-    assert json.loads(content) == pytest.approx({"hinge": math.radians(-60), "runner": 0.0})
+    (tmp_path / name).write_bytes(content)
+    assert read_configuration(tmp_path / name, bundle) == pytest.approx({"hinge": math.radians(-60), "runner": 0.0})
 
 
 def test_reset_brings_the_first_image_back(viewer, client):
@@ -114,6 +115,21 @@ def test_part_colours_recolour(client):
     start, before = len(client.messages), rest_image(client)
     switch(client, "Part colours", True)
     assert np.abs(rest_image(client, start).astype(int) - before).max() > 50
+
+
+def test_a_click_selects_a_part_and_another_ends_it(viewer, client):
+    before = rest_image(client)
+    rows, columns = np.nonzero(before[..., 1].astype(int) - before[..., 2] > 150)  # the lid is green
+    lid = float(np.median(columns) / before.shape[1]), float(np.median(rows) / before.shape[0])
+    for place, selected in ((lid, "lid"), (lid, None), (lid, "lid"), ((0.01, 0.01), None)):
+        start = len(client.messages)
+        ray = {"ray_origin": (0.0, 0.0, 0.0), "ray_direction": (0.0, 0.0, 1.0)}
+        told = {"type": "SceneNodeClickMessage", "name": "/backdrop", "instance_index": None, "screen_pos": place}
+        client._send({**told, **ray})
+        image = rest_image(client, start).astype(int)
+        assert viewer.panel.selected == selected
+        assert (np.abs(image - before).mean() > 1) == (selected is not None)
+        assert np.abs(image - before)[rows, columns].mean() < 3
 
 
 def test_a_sweep_moves_one_joint_after_the_other_until_somebody_takes_over(viewer, client):
