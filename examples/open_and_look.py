@@ -1,6 +1,8 @@
-"""Open the first joint of a bundle in steps, and save what a camera sees: colours, part labels and depth.
+"""Open the first joint of a bundle in steps and look at it.
 
-python examples/open_and_look.py demo/bundle pictures
+    python examples/open_and_look.py demo/bundle pictures
+
+Writes colours.png, labels.png and depth.png: five steps from the first state to the last, side by side.
 """
 
 import sys
