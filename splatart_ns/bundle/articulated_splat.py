@@ -134,6 +134,8 @@ class ArticulatedSplat:
         if len(posed) > 1 or len({*posed, *camera.batch} - {1}) > 1:
             found = f"configurations {list(posed)} and cameras {list(camera.batch)}"
             raise InputError(f"the batches of {found} do not go together; give B of both, or B of one")
+        if 0 in (*posed, *camera.batch):
+            raise InputError("the batch is empty; give one configuration and one camera or more")
 
         def seen(motions: Mapping[str, Tensor], viewmats: Tensor, Ks: Tensor) -> Rendering:
             splat = normalized(moved_splat(self._on_device, motions), self.normalization).select(shown)

@@ -23,10 +23,10 @@ JointValue = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | 
 def joint_motion(joint: Joint, value: JointValue) -> Tensor:
     """The child's motion relative to its parent [..., 4, 4] float64, canonical frame, at values (0 gives the identity).
 
-    Differentiable in `value`. Raises InputError for values of the wrong shape, or not finite.
+    On the CPU; differentiable in `value`. Raises InputError for values of the wrong shape, or not finite.
     """
     try:
-        value = torch.as_tensor(value, dtype=torch.float64)
+        value = torch.as_tensor(value, dtype=torch.float64).cpu()
     except (TypeError, ValueError) as error:
         raise InputError(f"joint '{joint.name}': {value!r} are no numbers; give radians or lengths") from error
     dofs = JOINT_DOFS[joint.type]

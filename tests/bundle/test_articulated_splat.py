@@ -164,6 +164,12 @@ def test_batches_that_do_not_go_together_are_refused(solid, cameras):
         solid.render(cameras, {"hinge": torch.zeros(2, 3)})
 
 
+def test_an_empty_batch_has_poses_and_no_picture(solid, camera):
+    assert solid.link_poses({"hinge": []})["door"].shape == (0, 4, 4)
+    with pytest.raises(InputError, match="the batch is empty"):
+        solid.render(camera, {"hinge": []})
+
+
 def test_an_unknown_part_is_refused(solid, camera):
     with pytest.raises(InputError, match="no part is called lid; there are base, door, latch"):
         solid.render(camera, parts=["lid"])
