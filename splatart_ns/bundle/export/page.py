@@ -22,6 +22,7 @@ import numpy as np
 
 from splatart_ns.bundle.animation import bundle_colours
 from splatart_ns.bundle.bundle import Bundle, Joint, Part
+from splatart_ns.bundle.camera import bounding_sphere, front_azimuth
 from splatart_ns.bundle.configurations import movable_joints
 from splatart_ns.bundle.export.quantization import quantized
 from splatart_ns.bundle.joint_axis import (
@@ -32,7 +33,6 @@ from splatart_ns.bundle.joint_axis import (
     value_deviations,
 )
 from splatart_ns.bundle.sliders import bundle_sliders, freedoms, unit_name
-from splatart_ns.bundle.viewpoint import bounding_sphere, front_azimuth
 
 FORMAT = "splatart-page-1"
 _SCRIPTS = (
