@@ -25,9 +25,12 @@ class Screw:
 
     def motion(self) -> Tensor:
         """The rigid motions [..., 4, 4]."""
-        R = so3_exp(self.angle[..., None] * self.axis)
-        t = self.point - (R @ self.point[..., None])[..., 0] + self.slide[..., None] * self.axis
-        return from_rotation_translation(R, t)
+        angle = self.angle[..., None]
+        # (1 - R) point by Rodrigues' formula: the line of a small turn is far away, and point - R point would cancel.
+        once = torch.linalg.cross(self.axis, self.point)
+        twice = torch.linalg.cross(self.axis, once)
+        t = self.slide[..., None] * self.axis - angle.sin() * once - 2 * (angle / 2).sin().square() * twice
+        return from_rotation_translation(so3_exp(angle * self.axis), t)
 
 
 def screw_from_motion(T: Tensor, reference: Tensor) -> Screw:

@@ -49,6 +49,7 @@ def quat_from_matrix(R: Tensor) -> Tensor:
 
 def matrix_from_quat(q: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of quaternions [..., 4], wxyz, of any non-zero norm."""
+    q = q / q.detach().abs().amax(-1, keepdim=True)  # so that squares neither overflow nor underflow
     return quaternion_to_rotation_matrix(q / torch.linalg.vector_norm(q, dim=-1, keepdim=True))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -11,8 +13,8 @@ from splatart_ns.geometry.se3 import matrix_from_quat
 def compute_relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor) -> tuple[Tensor, Tensor]:
     """What n Gaussians in one place must be to look together like the one that they replace.
 
-    Equation 9 of Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", with the sum of binomial
-    coefficients over i in closed form.
+    Equation 9 of Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", with its double sum as an
+    integral.
 
     Args:
         opacities: The Gaussian's opacity o [N].
@@ -25,13 +27,13 @@ def compute_relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms
     """
     n = ratios.clamp(1, len(binoms)).double()
     old = opacities.double()
-    new = 1 - (1 - old) ** (1 / n)
-    k = torch.arange(1, len(binoms) + 1, dtype=torch.float64, device=n.device)
-    # C(n, k) o^k alternate in sign and reach 1e14: float64, and 0 beyond k = n.
-    ways = (torch.lgamma(n + 1)[:, None] - torch.lgamma(k + 1) - torch.lgamma((n[:, None] - k).clamp_min(0) + 1)).exp()
-    signs = 1 - 2 * ((k - 1) % 2)
-    terms = signs * ways.round() * new[:, None] ** k / k.sqrt()
-    total = terms.where(k <= n[:, None], 0.0).sum(-1)
+    new = -torch.expm1(torch.log1p(-old) / n)
+    # The sum over k of -(-o)^k C(n, k) / sqrt(k) loses all digits to its signs. With 1 / sqrt(k) as the integral of
+    # 2 exp(-k u^2) / sqrt(pi) it is that of 1 - (1 - o exp(-u^2))^n, which is smooth and positive: by trapezoids.
+    step = 0.1
+    u = torch.arange(0, 7, step, dtype=torch.float64, device=n.device)
+    heights = -torch.expm1(n[:, None] * torch.log1p(-new[:, None] * torch.exp(-u * u)))
+    total = 2 / math.sqrt(math.pi) * step * (heights.sum(-1) - heights[:, 0] / 2)
     return new.to(opacities), scales * (old / total.where(total != 0, 1.0)).to(scales)[:, None]
 
 

@@ -51,3 +51,15 @@ def test_translation_and_identity_are_slides_with_finite_gradients(dtype):
     assert found.axis.tolist() == [[0, 0, 1], [0, -1, 0]] and found.point.tolist() == [[1, 1, 1], [1, 1, 1]]
     outputs = found.axis.sum() + found.point.sum() + found.slide.sum() + found.angle.sum()
     assert torch.autograd.grad(outputs, T)[0].isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_small_turn_about_a_far_line_moves_as_exactly_as_its_numbers(dtype):
+    """point - R point would keep only as many digits of the translation as the angle leaves."""
+    angle = 10 * torch.finfo(dtype).eps ** 0.75
+    axis, point = torch.tensor([0.0, 0.0, 1.0], dtype=dtype), torch.tensor([1 / angle, 0.0, 0.0], dtype=dtype)
+    T = Screw(axis, point, torch.tensor(angle, dtype=dtype), torch.tensor(0.25, dtype=dtype)).motion()
+    expected = torch.tensor([0.5 * angle, -1.0, 0.25], dtype=torch.float64)
+    assert torch.allclose(T[:3, 3].double(), expected, rtol=0, atol=4 * torch.finfo(dtype).eps)
+    rebuilt = screw_from_motion(T, torch.zeros(3, dtype=dtype)).motion()
+    assert torch.allclose(rebuilt, T, rtol=0, atol=10 * torch.finfo(dtype).eps)

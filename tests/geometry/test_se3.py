@@ -134,3 +134,16 @@ def test_inverse_and_points():
     assert torch.allclose(se3.inverse(T), torch.linalg.inv(T), rtol=0, atol=1e-14)
     homogeneous = torch.cat([x, torch.ones(20, 1, dtype=x.dtype)], -1)
     assert torch.allclose(se3.transform_points(T, x), (homogeneous @ T.mT)[..., :3], rtol=0, atol=1e-14)
+
+
+@both_dtypes
+@pytest.mark.parametrize("scale", [1e-25, 1e-8, 1e8, 1e25])
+def test_matrix_of_a_quaternion_of_any_norm(dtype, scale):
+    unit = torch.tensor([0.1, 0.7, -0.5, 0.5], dtype=dtype)  # of norm 1
+    q = (scale * unit).requires_grad_()
+    R = se3.matrix_from_quat(q)
+    expected = torch.autograd.functional.jacobian(se3.matrix_from_quat, unit)
+    found = torch.stack([torch.autograd.grad(v, q, retain_graph=True)[0] for v in R.flatten()]).reshape(3, 3, 4)
+    tolerance = 10 * torch.finfo(dtype).eps
+    assert torch.allclose(R, se3.matrix_from_quat(unit), rtol=0, atol=tolerance)
+    assert torch.allclose(scale * found, expected, rtol=0, atol=4 * tolerance)

@@ -1,5 +1,6 @@
 import math
 
+import mpmath
 import pytest
 import torch
 from scenes import HEIGHT, WIDTH, world_scene
@@ -23,6 +24,19 @@ def test_relocation_follows_the_papers_double_sum(n):
             for k in range(j)
         )
         torch.testing.assert_close(new_scales[i], scales[i] * old / total)
+
+
+@pytest.mark.parametrize("old", [1e-6, 0.5, 0.999999, 1.0])
+def test_many_gaussians_in_the_place_of_an_opaque_one_keep_their_digits(old):
+    """The alternating sum of 51 terms of up to 1e14 has to be summed in many digits, or not at all."""
+    opacity = torch.tensor([old], dtype=torch.float64)
+    new_opacity, new_scale = compute_relocation(opacity, torch.ones(1, 1).double(), torch.tensor([51]), BINOMS)
+    with mpmath.workdps(50):
+        new = 1 - (1 - mpmath.mpf(float(opacity))) ** (mpmath.mpf(1) / 51)
+        total = mpmath.fsum(-((-new) ** k) * mpmath.binomial(51, k) / mpmath.sqrt(k) for k in range(1, 52))
+        expected = float(new), old / float(total)
+    assert new_opacity.item() == pytest.approx(expected[0], rel=1e-14)
+    assert new_scale.item() == pytest.approx(expected[1], rel=1e-14)
 
 
 def test_more_than_the_most_ratio_counts_as_that():
