@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test fuzz lint clean
+.PHONY: demo test fuzz bench numerics lint clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -21,6 +21,13 @@ test: $(READY)
 
 fuzz: $(READY)
 	SPLATART_FUZZ_EXAMPLES=2000 $(BIN)/pytest tests/capture/test_fuzz.py tests/bundle/test_fuzz.py
+
+# BENCH=--quick for minutes instead of hours; captures with ground truth may follow.
+bench: $(READY)
+	$(BIN)/python benchmarks/bench.py $(BENCH)
+
+numerics: $(READY)
+	$(BIN)/python benchmarks/numerics.py
 
 lint: $(READY)
 	$(BIN)/ruff check --fix .

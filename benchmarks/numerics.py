@@ -20,6 +20,7 @@ from geometry_operations import GEOMETRY
 from image_operations import IMAGES
 from joint_fits import TRAVELS, TYPES, FitError, fit_error
 from joint_operations import JOINTS
+from pages import markdown, save
 from precision import Error, Measurement, measure
 
 matplotlib.use("Agg")
@@ -139,16 +140,11 @@ def fit_table(fits: dict[str, list[FitError]]) -> str:
     return markdown(("type", "states", "ADD", "at", "axis", "at", "of what is forced", "converged"), rows)
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
-
-
 def place(at: float) -> str:
     """A number, or how far below pi it is."""
     if 0 <= math.pi - at < 0.01:
         return "π" if at == math.pi else f"π - {math.pi - at:.0e}".replace("e-0", "e-")
-    return f"{at:.3g}".replace("e-0", "e-").replace("e+0", "e")
+    return f"{at:.6g}".replace("e-0", "e-").replace("e+0", "e")
 
 
 @dataclass
@@ -219,8 +215,7 @@ def draw(panels: Sequence[Panel], path: Path) -> None:
     for ax in axes.flat[len(panels) :]:
         ax.axis("off")
     figure.tight_layout()
-    figure.savefig(path, dpi=90, metadata={"Software": None})
-    plt.close(figure)
+    save(figure, path)
 
 
 if __name__ == "__main__":

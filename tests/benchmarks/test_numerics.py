@@ -9,7 +9,8 @@ from geometry_operations import GEOMETRY
 from image_operations import IMAGES
 from joint_fits import TYPES, fit_error
 from joint_operations import JOINTS
-from numerics import KEPT, LOST, markdown, place
+from numerics import KEPT, LOST, place
+from pages import markdown
 from precision import Case, Operation, measure
 
 BOUNDS = {
