@@ -17,6 +17,7 @@ import math
 import os
 import platform
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -49,6 +50,7 @@ class Options:
 
 
 def main(options: Options) -> None:
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # with the fit that is running, as Ctrl-C does
     start = time.monotonic()
     extent = QUICK if options.quick else FULL
     folder = options.output_dir.absolute() / ("quick" if options.quick else "full")

@@ -144,7 +144,7 @@ def place(at: float) -> str:
     """A number, or how far below pi it is."""
     if 0 <= math.pi - at < 0.01:
         return "π" if at == math.pi else f"π - {math.pi - at:.0e}".replace("e-0", "e-")
-    return f"{at:.6g}".replace("e-0", "e-").replace("e+0", "e")
+    return f"{at:.6g}".replace("e-0", "e-").replace("e+0", "e").replace("e+", "e")
 
 
 @dataclass
