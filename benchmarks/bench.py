@@ -55,9 +55,11 @@ def main(options: Options) -> None:
     extent = QUICK if options.quick else FULL
     folder = options.output_dir.absolute() / ("quick" if options.quick else "full")
     folder.mkdir(parents=True, exist_ok=True)
-    profile = Point("profile", extent.base, trade_offs(extent, [])[0].scene, quality=extent.base, weight=1.5)
     settings = trade_offs(extent, [path.absolute() for path in options.captures])
-    first = len(settings) // (extent.seeds * (len(extent.parts) + len(options.captures)))
+    scene = settings[0].truth or settings[0].scene
+    profile = Point("profile", extent.base, scene, quality=extent.base, weight=1.5)
+    # One object's settings first: a quick run that ends early has some of everything.
+    first = sum(point.seed == 0 and (point.truth or point.scene) == scene for point in settings)
     plan = [*settings[:first], profile, *growths(extent, extent.seeds), *settings[first:]]
     plan = [point for point in plan if options.only is None or options.only in point.key]
     results = folder / "results.jsonl"

@@ -82,6 +82,14 @@ class Extent:
     """The preset whose settings are varied one by one."""
     factors: tuple[float, ...]
     """Of the base's Gaussians and steps."""
+    sh_degrees: tuple[int, ...]
+    """Beside the default, 1."""
+    image_parts: tuple[int, ...]
+    """Images of 1 / n of the pixels a side."""
+    labelled: tuple[float, ...]
+    """Shares of the views with labels."""
+    high_everywhere: bool
+    """Whether the slowest preset runs on every object, or on the first alone."""
     growths: dict[str, tuple[int, ...]]
 
 
@@ -89,9 +97,13 @@ QUICK = Extent(
     parts=(2, 4),
     seeds=1,
     resolution=128,
-    views=16,
+    views=12,
     base="draft",
     factors=(0.5, 2.0),
+    sh_degrees=(0, 2),
+    image_parts=(2,),
+    labelled=(0.1,),
+    high_everywhere=False,
     growths={
         "Gaussians": (5000, 20000, 80000),
         "pixels a side": (128, 512, 1024),
@@ -100,12 +112,16 @@ QUICK = Extent(
     },
 )
 FULL = Extent(
-    parts=(2, 3, 5, 8),
-    seeds=3,
+    parts=(2, 3, 5),
+    seeds=2,
     resolution=256,
     views=40,
     base="standard",
-    factors=(0.25, 0.5, 2.0, 4.0),
+    factors=(0.25, 0.5, 2.0),
+    sh_degrees=(0, 2, 3),
+    image_parts=(2, 4),
+    labelled=(0.1, 0.3),
+    high_everywhere=True,
     growths={
         "Gaussians": (5000, 10000, 20000, 40000, 80000),
         "pixels a side": (128, 256, 512, 1024),
@@ -124,6 +140,8 @@ def trade_offs(extent: Extent, given: list[Path]) -> list[Point]:
     for seed in range(extent.seeds):
         for scene in scenes:
             turn = settings_on(scene, seed, extent)
+            if scene is not scenes[0] and not extent.high_everywhere:
+                turn = [point for point in turn if point.quality != "high"]
             random.Random(f"{seed} {scene.name}").shuffle(turn)
             points += turn
     return points
@@ -144,7 +162,7 @@ def settings_on(scene: Scene, seed: int, extent: Extent) -> list[Point]:
         points.append(
             point("iterations", text, *(f"effort.{n}=*{factor}" for n in ("steps", "merge_steps")), weight=factor)
         )
-    for degree in (0, 2, 3):
+    for degree in extent.sh_degrees:
         sh = (f"{stage}.pipeline.model.sh_degree={degree}" for stage in ("semantic", "pose", "joint"))
         points.append(point("SH degree", str(degree), *sh))
     steps = "pose.pipeline.model.pose_steps=200"
@@ -161,11 +179,11 @@ def settings_on(scene: Scene, seed: int, extent: Extent) -> list[Point]:
     points.append(point("joints", "gradient descent", "joint.pipeline.method=descent", weight=SLOW))
     points.append(point("rasterizer", "torch", rasterizer="torch", weight=SLOW))
     if scene.made:  # else there is no way to see the same object with fewer pixels or labels
-        for part in (2, 4):
+        for part in extent.image_parts:
             pixels = extent.resolution // part
             smaller = Scene(f"{scene.name}, {pixels} px", scene.source, replaced(scene.flags, "--resolution", pixels))
             points.append(point("image scale", f"1 / {part}", scene=smaller, truth=scene, weight=1 / part))
-        for fraction in (0.1, 0.3):
+        for fraction in extent.labelled:
             flags = (*scene.flags, "--labelled-fraction", str(fraction))
             fewer = Scene(f"{scene.name}, labels {fraction}", scene.source, flags)
             points.append(point("labelled frames", f"{fraction:.0%}", scene=fewer, truth=scene))
