@@ -136,7 +136,7 @@ def captured(scene: Scene, folder: Path) -> Path:
     """The folder of a scene's capture, rendered if it is not there."""
     if not scene.made:
         return Path(scene.source)
-    capture = folder / "captures" / scene.name.replace(" ", "_").replace("--", "")
+    capture = folder / "captures" / "_".join((scene.source, *scene.flags)).replace("--", "")
     if not (capture / "ground_truth.json").exists():
         shutil.rmtree(capture, ignore_errors=True)
         (folder / "captures").mkdir(exist_ok=True)

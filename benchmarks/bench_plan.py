@@ -88,8 +88,8 @@ class Extent:
     """Images of 1 / n of the pixels a side."""
     labelled: tuple[float, ...]
     """Shares of the views with labels."""
-    high_everywhere: bool
-    """Whether the slowest preset runs on every object, or on the first alone."""
+    slow_everywhere: bool
+    """Whether the slowest preset and joints by descent run on every object, or on the first alone."""
     growths: dict[str, tuple[int, ...]]
 
 
@@ -103,7 +103,7 @@ QUICK = Extent(
     sh_degrees=(0, 2),
     image_parts=(2,),
     labelled=(0.1,),
-    high_everywhere=False,
+    slow_everywhere=False,
     growths={
         "Gaussians": (5000, 20000, 80000),
         "pixels a side": (128, 512, 1024),
@@ -121,7 +121,7 @@ FULL = Extent(
     sh_degrees=(0, 2, 3),
     image_parts=(2, 4),
     labelled=(0.1, 0.3),
-    high_everywhere=True,
+    slow_everywhere=True,
     growths={
         "Gaussians": (5000, 10000, 20000, 40000, 80000),
         "pixels a side": (128, 256, 512, 1024),
@@ -140,8 +140,8 @@ def trade_offs(extent: Extent, given: list[Path]) -> list[Point]:
     for seed in range(extent.seeds):
         for scene in scenes:
             turn = settings_on(scene, seed, extent)
-            if scene is not scenes[0] and not extent.high_everywhere:
-                turn = [point for point in turn if point.quality != "high"]
+            if scene is not scenes[0] and not extent.slow_everywhere:
+                turn = [point for point in turn if point.quality != "high" and point.group != "joints"]
             random.Random(f"{seed} {scene.name}").shuffle(turn)
             points += turn
     return points
@@ -176,7 +176,7 @@ def settings_on(scene: Scene, seed: int, extent: Extent) -> list[Point]:
         ),
     }
     points += [point("poses", label, *settings, weight=SLOW) for label, settings in rungs.items()]
-    points.append(point("joints", "gradient descent", "joint.pipeline.method=descent", weight=SLOW))
+    points.append(point("joints", "gradient descent", "joint.pipeline.method=descent", weight=4))
     points.append(point("rasterizer", "torch", rasterizer="torch", weight=SLOW))
     if scene.made:  # else there is no way to see the same object with fewer pixels or labels
         for part in extent.image_parts:
