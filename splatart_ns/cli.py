@@ -323,6 +323,26 @@ def check(
         raise SystemExit(2)
 
 
+def labels(bundle: Annotated[Path, tyro.conf.Positional], data: Path, output: Path) -> None:
+    """Render part labels for the frames that have none, to be looked at and taken back by `splatart import --labels`.
+
+    Args:
+        bundle: Folder that `splatart fit` left.
+        data: Folder of the capture that it was fitted to.
+        output: A new folder for `labels`, PNGs of part ids, and `overlays`, pictures to look at.
+    """
+    from splatart_ns.bundle import load_bundle
+    from splatart_ns.bundle.rendered_labels import write_labels
+    from splatart_ns.capture.formats import load_capture
+
+    _choose_rasterizer("auto")
+    done = write_labels(load_bundle(bundle), load_capture(data), output, _device())
+    print(f"Labels: {len(done)} frames in {output / 'labels'}; look at {output / 'overlays'}, first at")
+    for one in done[:5]:
+        print(f"  {one.state}/{one.frame.name} ({one.doubtful:.0%} of the object's pixels left unlabelled)")
+    print(f"Take them: splatart import {data} --labels {output / 'labels'} --output-dir LABELLED")
+
+
 def synth(
     robot: Annotated[Path, tyro.conf.Positional],
     output_dir: Path,
@@ -391,6 +411,7 @@ def main() -> None:
     warnings.filterwarnings("ignore", category=FutureWarning)
     warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True")
     commands = {"fit": fit, "render": render, "view": view, "eval": evaluate, "check": check, "import": import_capture}
+    commands |= {"labels": labels}
     commands |= {"export": export, "synth": synth, "demo": demo}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="splatart", description=__doc__)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +16,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from splatart_ns.bundle.motion_file import read_motions
-from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.view import View, load_views
 from splatart_ns.errors import InputError
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_config
@@ -28,6 +27,7 @@ from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import initial_motion
+from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
 from splatart_ns.stages.visibility import visibility
 
 
@@ -128,12 +128,17 @@ class PosePipeline(VanillaPipeline):
         if test_mode != "val":  # a checkpoint brings everything
             return
         capture = self.datamanager.capture
-        self.views: list[list[View]] = [
-            [v.to(device) for view in load_views(capture, s, "train") if (v := with_silhouette(view)) is not None]
-            for s in range(len(capture.states))
-        ]
         runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
-        splats = [self._load_splat(run).to(device) for run in runs]
+        states = [self._load_splat(run).to(device) for run in runs]
+        # The parts are rendered without what surrounds them, so an image must say where the object ends.
+        self.views: list[list[View]] = [
+            [
+                with_silhouette(view) or rendered_silhouette(view, splat)
+                for view in (v.to(device) for v in load_views(capture, s, "train"))
+            ]
+            for s, splat in enumerate(states)
+        ]
+        splats = [splat.select(splat.part_ids > 0) for splat in states]
         S, P = len(splats), self.model.num_parts
         self._reference, self._known, self._frozen = [0] * P, torch.ones(S, P, dtype=torch.bool), torch.zeros(S, P) > 0
         self.model.start(splats, self._initial_poses(splats), self._frozen)
@@ -141,7 +146,7 @@ class PosePipeline(VanillaPipeline):
         self._own = self._shuffled_views()
 
     def _load_splat(self, run: Path) -> Splat:
-        """A state's labelled Gaussians without the background's."""
+        """A state's labelled Gaussians."""
         splat = splat_from_state(read_checkpoint(run))
         if splat.part_logits.shape[1] != self.model.num_parts + 1:
             raise InputError(
@@ -150,7 +155,7 @@ class PosePipeline(VanillaPipeline):
             )
         if not bool((splat.part_ids > 0).any()):
             raise InputError(f"{run} learned no parts; train splatart-semantic longer, with labelled frames.")
-        return splat.select(splat.part_ids > 0)
+        return splat
 
     def _initial_poses(self, splats: list[Splat]) -> Tensor:
         """Poses [S, P, 4, 4] to begin from; keeps in mind the reference states, and what is known and what stays."""
@@ -289,18 +294,6 @@ class PosePipeline(VanillaPipeline):
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         return {**super().get_param_groups(), "part_poses": list(self.model.poses.parameters())}
-
-
-def with_silhouette(view: View) -> View | None:
-    """The view with an alpha, for opaque images from their labels; None for one that has neither.
-
-    The parts are rendered without what surrounds them, so an image must say where the object ends.
-    """
-    if view.alpha is not None or view.labels is None:
-        return None if view.alpha is None else view
-    alpha = 255 * ((view.labels > 0) & (view.labels != UNLABELLED)).to(torch.uint8)
-    counts = view.labels != UNLABELLED
-    return replace(view, alpha=alpha, mask=counts if view.mask is None else view.mask & counts)
 
 
 def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
