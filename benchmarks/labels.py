@@ -72,6 +72,8 @@ def write_copy(source: Path, target: Path, count: int, noisy: bool) -> None:
     """The capture with `count` labelled training frames a state; `wrong.json` lists label files that are wrong."""
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(source, target, copy_function=os.link)
+    for folder in target.rglob("*/"):
+        folder.chmod(0o755)
     wrong = []
     for k, file in enumerate(sorted(target.glob("state_*/transforms.json"))):
         rng = np.random.default_rng([count, k])

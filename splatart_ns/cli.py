@@ -343,6 +343,28 @@ def labels(bundle: Annotated[Path, tyro.conf.Positional], data: Path, output: Pa
     print(f"Take them: splatart import {data} --labels {output / 'labels'} --output-dir LABELLED")
 
 
+def segment(
+    capture: Annotated[Path, tyro.conf.Positional], prompts: Path, output: Path, model: str | None = None
+) -> None:
+    """Make part labels from clicks and boxes with a promptable segmenter; take them by `splatart import --labels`.
+
+    Needs the extra `sam`, and a segmenter on this machine: nothing is downloaded.
+
+    Args:
+        capture: Folder of the capture.
+        prompts: JSON file {"STATE/FRAME": {"part": {"points": [[x, y]], "not": [[x, y]], "box": [x, y, x, y]}}}, pixels
+            from the image's top left corner.
+        output: A new folder for PNGs of part ids.
+        model: Folder of a SAM or SAM 2 for transformers, or its name in Hugging Face's cache.
+    """
+    from splatart_ns.capture import segmenter
+    from splatart_ns.capture.formats import load_capture
+
+    loaded, sam = load_capture(capture), segmenter.Sam(model or segmenter.DEFAULT_MODEL, _device())
+    print(f"Labels: {segmenter.segment(loaded, prompts, output, sam)} frames in {output}")
+    print(f"Take them: splatart import {capture} --labels {output} --output-dir LABELLED")
+
+
 def synth(
     robot: Annotated[Path, tyro.conf.Positional],
     output_dir: Path,
@@ -411,7 +433,7 @@ def main() -> None:
     warnings.filterwarnings("ignore", category=FutureWarning)
     warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True")
     commands = {"fit": fit, "render": render, "view": view, "eval": evaluate, "check": check, "import": import_capture}
-    commands |= {"labels": labels}
+    commands |= {"labels": labels, "segment": segment}
     commands |= {"export": export, "synth": synth, "demo": demo}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="splatart", description=__doc__)

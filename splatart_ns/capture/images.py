@@ -168,7 +168,7 @@ def undistort_labels(labels: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def undistorted_points(pixels: np.ndarray, camera: Camera) -> np.ndarray:
-    """Where the rays through pixel positions [N, 2] of a camera, distorted or not, cross the plane at depth 1: [N, 2]."""
+    """Where the rays through pixel positions [N, 2] of a camera, distorted or not, meet the plane at depth 1 [N, 2]."""
     if not camera.distorted:
         return (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -27,6 +27,7 @@ from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import initial_motion
+from splatart_ns.stages.semantic import ballots, trusted
 from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
 from splatart_ns.stages.visibility import visibility
 
@@ -132,10 +133,7 @@ class PosePipeline(VanillaPipeline):
         states = [self._load_splat(run).to(device) for run in runs]
         # The parts are rendered without what surrounds them, so an image must say where the object ends.
         self.views: list[list[View]] = [
-            [
-                with_silhouette(view) or rendered_silhouette(view, splat)
-                for view in (v.to(device) for v in load_views(capture, s, "train"))
-            ]
+            [with_silhouette(view) or rendered_silhouette(view, splat) for view in self._trusted_views(s, splat)]
             for s, splat in enumerate(states)
         ]
         splats = [splat.select(splat.part_ids > 0) for splat in states]
@@ -144,6 +142,16 @@ class PosePipeline(VanillaPipeline):
         self.model.start(splats, self._initial_poses(splats), self._frozen)
         self._pairs = self._shuffled_pairs()
         self._own = self._shuffled_views()
+
+    def _trusted_views(self, state: int, splat: Splat) -> list[View]:
+        """The training views of a state, without labels that contradict those of the other views."""
+        views = [view.to(splat.means.device) for view in load_views(self.datamanager.capture, state, "train")]
+        labelled = [i for i, view in enumerate(views) if view.labels is not None]
+        kept = trusted(ballots(splat, [views[i] for i in labelled], self.model.num_parts))
+        for i, keep in zip(labelled, kept.tolist(), strict=True):
+            if not keep:
+                views[i] = replace(views[i], labels=None)
+        return views
 
     def _load_splat(self, run: Path) -> Splat:
         """A state's labelled Gaussians."""

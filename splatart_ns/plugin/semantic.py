@@ -10,6 +10,7 @@ from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from splatart_ns.capture.view import View
@@ -17,7 +18,14 @@ from splatart_ns.errors import InputError
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.rasterize.ssim import l1_ssim_loss
 from splatart_ns.stages.hull import carve
-from splatart_ns.stages.semantic import accumulation_loss, part_image, segmentation_loss, vote_logits
+from splatart_ns.stages.semantic import (
+    accumulation_loss,
+    ballots,
+    part_image,
+    segmentation_loss,
+    trusted,
+    vote_logits,
+)
 
 
 @dataclass
@@ -155,7 +163,9 @@ class SemanticPipeline(VanillaPipeline):
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
+        self.notes: list[str] = []
         self._views: list[View] | None = None
+        self._labelled: set[int] = set()
 
     def get_train_loss_dict(self, step: int):
         if self.model.learns_parts:
@@ -164,17 +174,11 @@ class SemanticPipeline(VanillaPipeline):
             return outputs, self.model.get_loss_dict(outputs, batch), self.model.get_metrics_dict(outputs, batch)
         return super().get_train_loss_dict(step)
 
-    def _labelled(self) -> list[int]:
-        """The training frames with labels."""
-        frames = self.datamanager.train_dataset.metadata["frames"]
-        return [i for i, frame in enumerate(frames) if frame.labels is not None]
-
     def _next_labelled(self, step: int):
-        """The next labelled frame; frames without labels are passed over."""
-        labelled = set(self._labelled())
+        """The next labelled frame that is trusted; others are passed over."""
         while True:
             camera, batch = self.datamanager.next_train(step)
-            if batch["image_idx"] in labelled:
+            if batch["image_idx"] in self._labelled:
                 return camera, batch
 
     def get_training_callbacks(self, training_callback_attributes) -> list[TrainingCallback]:
@@ -187,8 +191,7 @@ class SemanticPipeline(VanillaPipeline):
         callbacks = super().get_training_callbacks(training_callback_attributes)
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         callbacks.append(TrainingCallback(before, self._keep_inside))
-        if self.model.config.vote_init:
-            callbacks.append(TrainingCallback(before, self._vote_at_semantic_start))
+        callbacks.append(TrainingCallback(before, self._vote))
         return callbacks
 
     def _keep_inside(self, step: int) -> None:
@@ -202,11 +205,19 @@ class SemanticPipeline(VanillaPipeline):
         if all(view.alpha is not None for view in self._views):
             self.model.fade_outside(self._views)
 
-    def _vote_at_semantic_start(self, step: int) -> None:
-        if step != self.model.config.semantic_start:
+    def _vote(self, step: int) -> None:
+        """Where the second phase begins: which frames' labels to trust, and what they say together."""
+        if step < self.model.config.semantic_start or self._labelled:
             return
         dataset = self.datamanager.train_dataset
-        views = [dataset.get_view(i) for i in self._labelled()]
-        logits = vote_logits(self.model.splat.detach(), views, self.model.num_parts)
-        with torch.no_grad():
-            self.model.gauss_params["semantics"].copy_(logits)
+        frames = dataset.metadata["frames"]
+        labelled = [i for i, frame in enumerate(frames) if frame.labels is not None]
+        votes = ballots(self.model.splat.detach(), [dataset.get_view(i) for i in labelled], self.model.num_parts)
+        kept = trusted(votes)
+        for i in (labelled[v] for v in (~kept).nonzero()[:, 0].tolist()):
+            self.notes.append(f"{frames[i].labels}: contradicts the other frames' labels and is not used.")
+            CONSOLE.log(self.notes[-1])
+        self._labelled = {labelled[v] for v in kept.nonzero()[:, 0].tolist()}
+        if self.model.config.vote_init and step == self.model.config.semantic_start:
+            with torch.no_grad():
+                self.model.gauss_params["semantics"].copy_(vote_logits(votes[kept]))

@@ -24,7 +24,7 @@ def surrounding_points(views: Sequence[View], count: int, generator: torch.Gener
     """Points on all that the views show: each on the ray of a pixel drawn at random, where the views' colours agree.
 
     A plane sweep for single pixels: the depth is taken at which the median difference between the pixel and what the
-    other views show there, of blurred colours, is least. Where fewer than three other views see any depth, one is drawn.
+    views show there, of blurred colours, is least. Where no depth is seen by three views, one is drawn at random.
     """
     index = torch.randint(len(views), (count,), generator=generator)
     place = torch.rand(count, 2, generator=generator)
