@@ -79,7 +79,9 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
             outlined = [v for view in views if (v := with_silhouette(view)) is not None]
             around = surrounding_points(views, count, generator) if points is None else points.drawn(count, generator)
             points = seed_points(outlined, len(self.capture.parts), count, generator) if outlined else None
-            points = points and points.joined(around)
+            if points is not None:
+                points = points.joined(around)
+                self.train_dataset.metadata["points3D_around"] = len(around.xyz)
         elif points is None:
             points = seed_points(views, len(self.capture.parts), count, generator)
         if points is not None:

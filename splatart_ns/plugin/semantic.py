@@ -40,7 +40,7 @@ class SemanticModelConfig(SplatartModelConfig):
     vote_init: bool = True
     """Whether the logits start from the labels' votes, counted in one backward pass a labelled view."""
     max_gaussians: int = 12000
-    """Gaussians are not split or duplicated beyond this number, or beyond 3 / 2 of those that it starts from."""
+    """Gaussians are not split or duplicated beyond this number, and 3 / 2 of those that start on the surroundings."""
     background_color: Literal["random", "black", "white"] = "random"
 
 
@@ -72,7 +72,7 @@ class SemanticModel(SplatartModel):
             verbose=False,
         )
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
-        self._most_gaussians = max(config.max_gaussians, 3 * self.num_points // 2)
+        self._for_surroundings = 3 * self.kwargs["metadata"].get("points3D_around", 0) // 2
 
     @property
     def learns_parts(self) -> bool:
@@ -108,7 +108,7 @@ class SemanticModel(SplatartModel):
 
     def _limit_growth(self) -> None:
         """Raise the strategy's threshold so that only the neediest Gaussians that there is room for grow."""
-        room = self._most_gaussians - self.num_points
+        room = self.config.max_gaussians + self._for_surroundings - self.num_points
         self.strategy.grow_grad2d = self.config.densify_grad_thresh
         if self.strategy_state["count"] is None or room >= self.num_points:
             return

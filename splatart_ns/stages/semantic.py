@@ -12,9 +12,9 @@ from splatart_ns.capture.view import View
 from splatart_ns.rasterize.render import Rendering, render
 from splatart_ns.splats.splat import Splat
 
-WRONG_PART = 0.6
-"""A view's labels are wrong where it contradicts the others on so much of a part, and on so many pixels of it."""
-_ENOUGH_PIXELS = 30
+WRONG_OBJECT = 0.6
+"""A view's labels are wrong where it contradicts the others on so much of the object. Less would not do: of what is
+seen edge on, right labels say something else than Gaussians behind its rim."""
 
 
 def accumulation_loss(accumulation: Tensor, alpha: Tensor) -> Tensor:
@@ -64,33 +64,27 @@ def ballots(splat: Splat, views: Sequence[View], num_parts: int) -> Tensor:
 def trusted(votes: Tensor) -> Tensor:
     """Which views' ballots [V, N, P + 1] do not contradict the others: bool [V].
 
-    The view goes that contradicts the others most, as long as it calls most of some part another; of fewer than three
-    views nobody can tell which is wrong.
+    The view goes that contradicts the others most, as long as one contradicts them on much of the object. Of fewer than
+    three views nobody can tell which is wrong.
     """
     kept = torch.ones(len(votes), dtype=torch.bool, device=votes.device)
     while kept.sum() >= 3:
         total = votes[kept].sum(0)
-        worst, most = None, 0.0
-        for v in kept.nonzero()[:, 0].tolist():
-            number, wrong = _contradicted(votes[v], total - votes[v])
-            contradicts = (wrong > WRONG_PART * number) & (number > _ENOUGH_PIXELS)
-            share = float(wrong.sum() / number.sum().clamp_min(1))
-            if contradicts.any() and share > most:
-                worst, most = v, share
-        if worst is None:
+        share = torch.stack(
+            [_contradiction(v, total - v) if k else total.new_zeros(()) for v, k in zip(votes, kept, strict=True)]
+        )
+        if share.max() <= WRONG_OBJECT:
             break
-        kept[worst] = False
+        kept[share.argmax()] = False
     return kept
 
 
-def _contradicted(ballot: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels that a ballot [N, P + 1] casts on the Gaussians of each part by the others' votes, and those of them that
-    have another label: both [P]."""
+def _contradiction(ballot: Tensor, others: Tensor) -> Tensor:
+    """The share of a ballot's votes [N, P + 1] on the parts' Gaussians, as the others see them, for another label."""
     amount, part = others.max(-1)
-    cast = torch.where(amount > 0, ballot.sum(-1), 0.0)
-    wrong = torch.where(amount > 0, cast - ballot.gather(-1, part[:, None])[:, 0], 0.0)
-    parts = ballot.shape[1]
-    return tuple(torch.zeros(parts, device=ballot.device).index_add(0, part, x)[1:] for x in (cast, wrong))
+    counts = (amount > 0) & (part > 0)
+    cast, agreeing = ballot.sum(-1)[counts], ballot.gather(-1, part[:, None])[counts, 0]
+    return (cast - agreeing).sum() / cast.sum().clamp_min(1)
 
 
 def vote_logits(votes: Tensor) -> Tensor:

@@ -67,14 +67,9 @@ def swapped(view):
     return replace(view, labels=torch.where(view.labels > 0, 3 - view.labels, 0))
 
 
-def forgotten_part(view):
-    return replace(view, labels=torch.where(view.labels == 2, 0, view.labels))
-
-
-@pytest.mark.parametrize("spoil", [swapped, forgotten_part])
 @pytest.mark.parametrize("wrong", [{3}, {1, 5, 6}])
-def test_views_that_contradict_the_others_are_not_trusted(spoil, wrong):
-    views = [spoil(view) if i in wrong else view for i, view in enumerate(VIEWS[:9])]
+def test_views_that_contradict_the_others_are_not_trusted(wrong):
+    views = [swapped(view) if i in wrong else view for i, view in enumerate(VIEWS[:9])]
     kept = trusted(ballots(SPLAT, views, 2))
     assert {i for i, keep in enumerate(kept.tolist()) if not keep} == wrong
 
