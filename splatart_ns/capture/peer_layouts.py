@@ -81,8 +81,8 @@ def _artgs_frame(file: Path, root: Path, split: str, meta: dict[str, Any], i: in
 
 def _read_dta(path: Path, report: Report) -> list[State]:
     """`init_keyframes.yml`: `frame_ID: {cam_in_ob: 16 numbers of an OpenGL camera-to-world pose, time: 0 or 1}`;
-    `cam_K.txt`; `color_segmented/ID.png`, `mask/ID.png` and, in thousandths, `depth_filtered/ID.png`. Every 8th frame of
-    a state is for tests."""
+    `cam_K.txt`; `color_segmented/ID.png`, `mask/ID.png` and, in thousandths, `depth_filtered/ID.png`. Every 8th frame
+    of a state is for tests."""
     file = path / "init_keyframes.yml"
     try:
         keyframes = yaml.safe_load(read_text(file))
