@@ -54,6 +54,38 @@ def fit(
     CONSOLE.print(f"Bundle: {run(capture, output_dir, quality, root, seed, rasterizer, joint)}")
 
 
+def batch(
+    root: Annotated[str, tyro.conf.Positional],
+    output_dir: str,
+    quality: Quality = "standard",
+    seed: int = 0,
+    export: tuple[Literal["urdf", "mjcf", "usd", "glb", "ply"], ...] = (),
+    rasterizer: Rasterizer = "auto",
+    address: str | None = None,
+    retry_failed: bool = False,
+) -> None:
+    """Fit many captures: each becomes a bundle in the output folder; run it again to do what is missing or changed.
+
+    The exit code is 0 when all objects are done, 3 when some have failed, 4 when all have, 2 for a mistake in what was
+    asked. OUTPUT_DIR/report.html and report.csv tell of every object.
+
+    Args:
+        root: A folder above captures, or a manifest: .csv or .jsonl with path, and optionally name, quality, root,
+            seed, joints. Folders may be fsspec URLs (s3://, gs://).
+        output_dir: A folder or an fsspec URL.
+        quality: As in `splatart fit`.
+        seed: As in `splatart fit`.
+        export: Write these formats, too.
+        rasterizer: As in `splatart fit`.
+        address: Run on the Ray cluster there (auto, ray://HOST:PORT) instead of this machine's cores.
+        retry_failed: Try again what has failed before.
+    """
+    from splatart_ns.batch.command import run
+
+    settings = {"quality": quality, "root": None, "seed": seed, "joints": []}
+    raise SystemExit(run(root, output_dir, settings, rasterizer, export, address, retry_failed, CONSOLE))
+
+
 def render(
     bundle: Annotated[Path, tyro.conf.Positional],
     output: Path,
@@ -434,7 +466,7 @@ def main() -> None:
     warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True")
     commands = {"fit": fit, "render": render, "view": view, "eval": evaluate, "check": check, "import": import_capture}
     commands |= {"labels": labels, "segment": segment}
-    commands |= {"export": export, "synth": synth, "demo": demo}
+    commands |= {"batch": batch, "export": export, "synth": synth, "demo": demo}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="splatart", description=__doc__)
         sys.stdout.flush()
@@ -452,5 +484,5 @@ def main() -> None:
         print(f"error: {error.filename}: cannot be read or written ({error.strerror}); {mend}.", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
-        print("Interrupted. An unfinished `splatart fit` goes on when it is started again.", file=sys.stderr)
+        print("Interrupted. An unfinished fit or batch goes on when it is started again.", file=sys.stderr)
         raise SystemExit(130) from None

@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 
 BELOW = {
     "errors": set(),
+    "machine": set(),
     "files": {"errors"},
     "records": {"errors"},
     "geometry": {"errors"},
@@ -22,9 +23,10 @@ BELOW = {
 BELOW["bundle"] = BELOW["stages"] | {"files", "records", "stages"}
 BELOW["evaluation"] = BELOW["bundle"] | {"bundle"}
 BELOW["viewer"] = BELOW["bundle"] | {"bundle"}
-BELOW["plugin"] = BELOW["bundle"] | {"bundle"}
+BELOW["plugin"] = BELOW["bundle"] | {"bundle", "machine"}
+BELOW["batch"] = BELOW["plugin"] | {"plugin"}
 BELOW["method_configs"] = {"plugin"}
-BELOW["cli"] = {"bundle", "capture", "errors", "evaluation", "plugin", "rasterize", "viewer"}
+BELOW["cli"] = {"batch", "bundle", "capture", "errors", "evaluation", "plugin", "rasterize", "viewer"}
 """What each part of the package may import of the others."""
 
 ABOVE_THE_METHODS = {"splatart_ns/plugin/fit.py": {"method_configs"}}

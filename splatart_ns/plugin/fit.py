@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import json
 import platform
 import shutil
@@ -24,6 +23,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from splatart_ns.bundle import load_bundle
 from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.check import require_valid
+from splatart_ns.capture.digest import capture_digest
 from splatart_ns.errors import InputError
 from splatart_ns.files import write_json
 from splatart_ns.method_configs.joint import method as joint_method
@@ -66,6 +66,21 @@ class Settings:
     joints: list[str] = field(default_factory=list)
 
 
+def report_head(capture: Capture, settings: Settings) -> dict[str, Any]:
+    """What was fitted, how, and by what."""
+    return {
+        "capture": str(capture.path.absolute()),
+        "capture_sha256": capture_digest(capture),
+        "settings": asdict(settings),
+        "seed": settings.seed,
+        "device": "cuda: " + torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
+        "rasterizer": default_backend(),
+        "threads": torch.get_num_threads(),
+        "versions": {"python": platform.python_version()}
+        | {name: version(name) for name in ("splatart-ns", "nerfstudio", "torch", "gsplat", "numpy")},
+    }
+
+
 class Report:
     """report.json: which stages have finished, and what they took. Written before and after each stage.
 
@@ -74,19 +89,7 @@ class Report:
 
     def __init__(self, path: Path, capture: Capture, settings: Settings):
         self.path = path
-        self.data: dict[str, Any] = {
-            "capture": str(capture.path.absolute()),
-            "capture_sha256": _digest(capture),
-            "settings": asdict(settings),
-            "seed": settings.seed,
-            "device": "cuda: " + torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
-            "rasterizer": default_backend(),
-            "threads": torch.get_num_threads(),
-            "versions": {"python": platform.python_version()}
-            | {name: version(name) for name in ("splatart-ns", "nerfstudio", "torch", "gsplat", "numpy")},
-            "stages": [],
-            "seconds": 0.0,
-        }
+        self.data = report_head(capture, settings) | {"stages": [], "seconds": 0.0}
         self._earlier = self._read_stages() if path.exists() else []
         self._last = time.perf_counter()
 
@@ -140,18 +143,6 @@ class Report:
         write_json(self.path, self.data)
 
 
-def _digest(capture: Capture) -> str:
-    """Of all that a fit reads of a capture."""
-    digest = hashlib.sha256(repr((capture.parts, capture.length_unit)).encode())
-    for state in capture.states:
-        digest.update(state.name.encode() + (state.points.read_bytes() if state.points else b""))
-        for frame in state.frames:
-            digest.update(repr((frame.name, frame.camera, frame.T_world_camera.tolist(), frame.split)).encode())
-            for file in (frame.image, frame.labels, frame.object_mask, frame.mask, frame.depth):
-                digest.update(file.read_bytes() if file else b"-")
-    return digest.hexdigest()
-
-
 def fit(
     capture_path: Path,
     output_dir: Path,
@@ -167,16 +158,9 @@ def fit(
         InputError: for a capture, a root, a joint, a folder or a rasterizer that cannot be used.
     """
     set_backend(rasterizer)
-    capture = require_valid(capture_path)
-    if root is not None and root not in capture.parts.values():
-        raise InputError(
-            f"{capture_path} has no part '{root}'; choose --root from {', '.join(capture.parts.values())}."
-        )
-    parse_constraints(joints, capture.parts, next((p for p, name in capture.parts.items() if name == root), None))
-    if not 0 <= seed < 2**32:
-        raise InputError(f"--seed is {seed}; give 0 to {2**32 - 1}.")
-    output_dir = output_dir.absolute()
     settings = Settings(quality, root, seed, rasterizer, list(joints))
+    capture = require_fittable(capture_path, settings)
+    output_dir = output_dir.absolute()
     report = Report(output_dir / "report.json", capture, settings)
     try:
         (output_dir / "runs").mkdir(parents=True, exist_ok=True)
@@ -186,15 +170,40 @@ def fit(
     except OSError as error:
         raise InputError(f"{output_dir} cannot be written ({error.strerror}); choose another --output-dir.") from None
 
-    runs = output_dir / "runs"
-    semantic = [_semantic_config(capture, index, runs, settings) for index in range(len(capture.states))]
-    pose = _pose_config(capture, [_config_file(config) for config in semantic], runs, settings)
-    joint = _joint_config(capture, _config_file(pose), runs, settings)
+    configs = stage_configs(capture, output_dir, settings)
+    pose, joint = (configs.pop(name) for name in ("pose", "joint"))
     with _progress() as progress:
-        _train({f"semantic {c.experiment_name}": c for c in semantic}, rasterizer, report, progress)
+        _train(configs, rasterizer, report, progress)
         _train({"pose": pose}, rasterizer, report, progress)
         _train({"joint": joint}, rasterizer, report, progress, whole=_is_whole(output_dir))
     return output_dir
+
+
+def require_fittable(capture_path: Path, settings: Settings) -> Capture:
+    """Load and check a capture, and the settings that are about it.
+
+    Raises:
+        InputError: for a capture, a root, a joint or a seed that cannot be used.
+    """
+    capture, root = require_valid(capture_path), settings.root
+    if root is not None and root not in capture.parts.values():
+        raise InputError(
+            f"{capture_path} has no part '{root}'; choose --root from {', '.join(capture.parts.values())}."
+        )
+    number = next((p for p, name in capture.parts.items() if name == root), None)
+    parse_constraints(settings.joints, capture.parts, number)
+    if not 0 <= settings.seed < 2**32:
+        raise InputError(f"--seed is {settings.seed}; give 0 to {2**32 - 1}.")
+    return capture
+
+
+def stage_configs(capture: Capture, bundle: Path, settings: Settings) -> dict[str, TrainerConfig]:
+    """Every stage by its name, in order: `semantic STATE` of each state, `pose`, `joint`; runs are below the bundle."""
+    runs = bundle / "runs"
+    semantic = [_semantic_config(capture, index, runs, settings) for index in range(len(capture.states))]
+    pose = _pose_config(capture, [_config_file(config) for config in semantic], runs, settings)
+    joint = _joint_config(capture, _config_file(pose), runs, settings)
+    return {f"semantic {c.experiment_name}": c for c in semantic} | {"pose": pose, "joint": joint}
 
 
 def _semantic_config(capture: Capture, state: int, runs: Path, settings: Settings) -> TrainerConfig:

@@ -26,6 +26,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from splatart_ns.errors import InputError
+from splatart_ns.machine import num_cores
 from splatart_ns.plugin.compat import seed_everything, stop_event_writers
 from splatart_ns.rasterize.rasterization import Backend, set_backend
 
@@ -56,7 +57,7 @@ def run_stage(config: TrainerConfig, on_step: Callable[[int], None]) -> Outcome:
 
 def num_processes(runs: int) -> int:
     """How many runs to train side by side: one thread a run is faster than many threads a run, one after the other."""
-    return 1 if torch.cuda.is_available() else max(1, min(runs, _num_cores()))
+    return 1 if torch.cuda.is_available() else max(1, min(runs, num_cores()))
 
 
 def run_side_by_side(
@@ -74,7 +75,7 @@ def run_side_by_side(
         InputError: raised by a run.
         RuntimeError: a run ended otherwise; its last words are in the message.
     """
-    threads = max(1, _num_cores() // processes)
+    threads = max(1, num_cores() // processes)
     events: SimpleQueue[tuple[int, str, Any]] = SimpleQueue()
     waiting, outcomes, following = list(range(len(configs))), {}, 0
     with ExitStack() as running:
@@ -155,13 +156,6 @@ def _serve(source: BinaryIO, tell: Callable[[str, Any], None]) -> None:
         tell("outcome", run_stage(config, on_step))
     except InputError as error:
         tell("input error", str(error))
-
-
-def _num_cores() -> int:
-    threads = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]  # "4,2" is for nested regions
-    if threads.isdigit():
-        return max(1, int(threads))
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _peak_memory_mb() -> int:

@@ -1,0 +1,1 @@
+"""Many captures to many bundles, on one machine or on a Ray cluster."""

@@ -1,0 +1,174 @@
+"""Processes of this machine that run stages."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import tempfile
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from typing import IO, Any, Protocol
+
+from splatart_ns.batch.stage import Needs
+from splatart_ns.machine import memory_mb, num_cores, num_gpus
+
+THREADS = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+"""Environment of every stage, on whatever machine: sums depend on the number of threads."""
+_TASKS_PER_PROCESS = 200
+"""Then a fresh process takes over, whatever libraries have piled up in the old one."""
+
+
+class Death(Exception):
+    """A task's process ended before the task; the message says how."""
+
+
+class Engine(Protocol):
+    """Runs functions somewhere else."""
+
+    def fits(self, needs: Needs) -> bool:
+        """Whether another task can be started now."""
+
+    def start(self, ticket: Any, needs: Needs, function: Callable, *arguments: Any) -> None:
+        """Start a task; `ticket` comes back with its result."""
+
+    def wait(self, seconds: float) -> list[tuple[Any, Any]]:
+        """Tickets and results, or a `Death`, of tasks that have ended; [] when none does in so many seconds."""
+
+    def close(self) -> None:
+        """End all processes and what they are at."""
+
+
+class ProcessPool:
+    """As many processes as cores; a task starts when the memory that it needs is free.
+
+    Each GPU belongs to one process. A process that dies takes only its own task with it.
+    """
+
+    def __init__(self, cores: int | None = None, memory: int | None = None, gpus: int | None = None):
+        cores = num_cores() if cores is None else cores
+        self._memory = int(0.9 * memory_mb()) if memory is None else memory
+        visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+        gpus = num_gpus() if gpus is None else gpus
+        names = visible[:gpus] if len(visible) >= gpus > 0 and visible[0] else [str(i) for i in range(gpus)]
+        self._workers = [_Worker(name) for name in names]
+        self._workers += [_Worker("") for _ in range(max(cores - len(names), 1 if not names else 0))]
+        self.gpus = len(names)
+
+    def fits(self, needs: Needs) -> bool:
+        busy = [worker for worker in self._workers if worker.task is not None]
+        free = self._memory - sum(worker.task.needs.memory_mb for worker in busy)
+        return self._free_worker(needs) is not None and (not busy or needs.memory_mb <= free)
+
+    def start(self, ticket: Any, needs: Needs, function: Callable, *arguments: Any) -> None:
+        worker = self._free_worker(needs)
+        assert worker is not None
+        worker.start(_Task(ticket, needs), function, arguments)
+
+    def wait(self, seconds: float) -> list[tuple[Any, Any]]:
+        busy = {worker.pipe: worker for worker in self._workers if worker.task is not None}
+        return [busy[pipe].result() for pipe in wait(list(busy), seconds)]
+
+    def close(self) -> None:
+        for worker in self._workers:
+            worker.end()
+
+    def _free_worker(self, needs: Needs) -> _Worker | None:
+        with_gpu = needs.gpu and self.gpus > 0
+        free = [worker for worker in self._workers if worker.task is None]
+        fitting = [worker for worker in free if bool(worker.gpu) == with_gpu]
+        if not fitting and not with_gpu and all(worker.gpu for worker in self._workers):
+            fitting = free  # no more cores than GPUs
+        return min(fitting, key=lambda worker: worker.process is None, default=None)
+
+
+@dataclass
+class _Task:
+    ticket: Any
+    needs: Needs
+
+
+class _Worker:
+    """A process, started when it has something to do, and its task."""
+
+    def __init__(self, gpu: str):
+        self.gpu = gpu
+        """The CUDA device that it sees, "" for none."""
+        self.process: multiprocessing.process.BaseProcess | None = None
+        self.pipe: Connection | None = None
+        self.task: _Task | None = None
+        self._words: IO[bytes] | None = None
+        self._tasks_left = 0
+
+    def start(self, task: _Task, function: Callable, arguments: tuple) -> None:
+        if self._tasks_left == 0:
+            self.end()
+        if self.process is None:
+            self._spawn()
+        self.task = task
+        self._tasks_left -= 1
+        try:
+            self.pipe.send((function, arguments))
+        except OSError:  # it died meanwhile: `result` says so
+            pass
+
+    def result(self) -> tuple[Any, Any]:
+        ticket = self.task.ticket
+        self.task = None
+        try:
+            return ticket, self.pipe.recv()
+        except (EOFError, OSError):
+            self.process.join()
+            code = self.process.exitcode
+            self._words.seek(0)
+            words = self._words.read().decode(errors="replace").strip().splitlines()
+            self.end()
+        if code is not None and code < 0:
+            name = signal.Signals(-code).name
+            why = " (was there too little memory?)" if -code == signal.SIGKILL else ""
+            return ticket, Death(f"the process was ended by {name}{why}")
+        return ticket, Death(f"the process ended with exit code {code}: {words[-1] if words else 'no word'}"[:500])
+
+    def end(self) -> None:
+        if self.process is not None:
+            self.process.kill()  # its files are whole, or its stage is repeated
+            self.process.join()
+            self.pipe.close()
+            self._words.close()
+        self.process = self.task = None
+        self._tasks_left = 0
+
+    def _spawn(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, other = context.Pipe()
+        self._words = tempfile.NamedTemporaryFile(prefix="splatart-batch-", suffix=".log")
+        self.process = context.Process(target=_serve, args=(other, self._words.name), daemon=True)
+        told = THREADS | {"CUDA_VISIBLE_DEVICES": self.gpu}
+        before = {key: os.environ.get(key) for key in told}
+        os.environ.update(told)  # libraries read it when the process imports them
+        try:
+            self.process.start()
+        finally:
+            for key, value in before.items():
+                os.environ.pop(key) if value is None else os.environ.update({key: value})
+        other.close()
+        self._tasks_left = _TASKS_PER_PROCESS
+
+
+def _serve(pipe: Connection, words: str) -> None:
+    """The process: run what comes through the pipe, until the other end closes it or dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that ends this one
+    log = os.open(words, os.O_WRONLY | os.O_APPEND)
+    for stream in (1, 2):
+        os.dup2(log, stream)
+    parent = multiprocessing.parent_process()
+    threading.Thread(target=lambda: (wait([parent.sentinel]), os._exit(1)), daemon=True).start()
+    while True:
+        try:
+            function, arguments = pipe.recv()
+        except EOFError:
+            return
+        os.truncate(words, 0)  # the last words are those of the task
+        pipe.send(function(*arguments))

@@ -1,0 +1,217 @@
+"""One step of one object: what it needs, and how its result is kept under the hash of its inputs and settings."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol
+from urllib.parse import quote
+
+from splatart_ns.batch.entry import Entry
+from splatart_ns.batch.storage import FileInfo, Folder, Storage, open_storage, publish
+from splatart_ns.errors import InputError
+
+MARKERS = "stages"
+"""Folder in a bundle of a file per stage that says how it ended."""
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a stage takes of a machine."""
+
+    cores: int = 1
+    memory_mb: int = 1000
+    gpu: bool = False
+    """Whether it computes on a GPU where there are GPUs."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of one object."""
+
+    name: str
+    key: str
+    """Hash of all that decides the result; see `stage_key`."""
+    after: tuple[str, ...] = ()
+    """Stages that it waits for."""
+    needs: Needs = field(default_factory=Needs)
+
+
+@dataclass(frozen=True)
+class Marker:
+    """How a stage ended."""
+
+    key: str
+    seconds: float
+    outcome: dict[str, Any] = field(default_factory=dict)
+    files: dict[str, int] = field(default_factory=dict)
+    """Size of every file it left, by its name in the bundle."""
+    failed: str = ""
+    """Why it left nothing: one sentence."""
+    kind: Literal["", "input", "crash", "died"] = ""
+    """Of the failure: what the user can mend, what broke in the program, a process that was killed."""
+    trace: str = ""
+
+    def is_whole(self, key: str, files: dict[str, FileInfo]) -> bool:
+        """Whether the result is there and of these inputs; `files` are those of the bundle."""
+        return (
+            self.key == key
+            and not self.failed
+            and all(name in files and files[name].size == size for name, size in self.files.items())
+        )
+
+
+class Recipe(Protocol):
+    """What is done with every object. It is pickled: workers get a copy."""
+
+    def stages(self, entry: Entry, fingerprint: str, told: dict[str, Any] | None) -> list[Stage]:
+        """All stages, two or more, in order; only the first while what it tells (its outcome) is not known.
+
+        `fingerprint` changes with any file of the capture.
+        """
+
+    def run(self, stage: str, work: Work) -> tuple[dict[str, Any], Sequence[str]]:
+        """Do a stage in `work.folder`; returns its outcome, and the files or folders in it to keep, the last one last.
+
+        Raises:
+            InputError: what the user can mend.
+        """
+
+    def row(self, entry: Entry, outcomes: dict[str, dict[str, Any]]) -> dict[str, Any]:
+        """What the report says of an object whose stages all ended well."""
+
+
+@dataclass
+class Work:
+    """What a stage gets: a scratch folder, and what earlier stages left."""
+
+    entry: Entry
+    out: Storage
+    folder: Path
+    """Becomes part of the bundle; empty at first."""
+
+    @property
+    def home(self) -> Path:
+        """Where the bundle will be; a relative path when that is no folder of this machine."""
+        return Path(self.out.url, self.entry.name) if isinstance(self.out, Folder) else Path(self.entry.name)
+
+    def fetch(self, *paths: str) -> None:
+        """Get folders or files that earlier stages left into `folder`."""
+        for path in paths:
+            data = self.out.read(f"{self.entry.name}/{path}") if Path(path).suffix else None
+            if data is not None:
+                (self.folder / path).write_bytes(data)
+            else:
+                self.out.get(f"{self.entry.name}/{path}", self.folder / path)
+
+    def outcome(self, stage: str) -> dict[str, Any]:
+        """Of an earlier stage."""
+        marker = read_marker(self.out, self.entry.name, stage)
+        if marker is None:
+            raise InputError(f"{self.entry.name}: the stage {stage} is not there any more; run the batch again.")
+        return marker.outcome
+
+    @contextmanager
+    def capture(self) -> Iterator[Path]:
+        """The folder of the capture; a copy for the time being, if it is not on this machine."""
+        storage = open_storage(self.entry.capture)
+        if isinstance(storage, Folder):
+            yield Path(storage.url)
+            return
+        with tempfile.TemporaryDirectory(dir=self.folder.parent) as copy:
+            # Under its own name, which messages about its files begin with.
+            folder = Path(copy, self.entry.capture.rstrip("/").rsplit("/", 1)[-1])
+            folder.mkdir()
+            storage.get("", folder)
+            yield folder
+
+
+def stage_key(*inputs: Any) -> str:
+    """Hash of JSON values: the stage, the version of the package, settings, and hashes of inputs."""
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+
+
+def fingerprint(capture: str) -> str:
+    """Hash of the names, sizes and stamps of a capture's files; they are not read.
+
+    Raises:
+        InputError: no file is there.
+    """
+    files = open_storage(capture).files("")
+    if not files:
+        raise InputError(f"{capture}: there is nothing; correct the path.")
+    return stage_key(sorted((name, info.size, info.stamp) for name, info in files.items()))
+
+
+def read_marker(out: Storage, name: str, stage: str) -> Marker | None:
+    """How a stage ended, if it did. A damaged marker counts as none."""
+    data = out.read(_marker_path(name, stage))
+    try:
+        return None if data is None else Marker(**json.loads(data))
+    except (ValueError, TypeError):
+        return None
+
+
+def write_marker(out: Storage, name: str, stage: str, marker: Marker) -> None:
+    """Say how a stage ended."""
+    told = {key: value for key, value in marker.__dict__.items() if value or key in ("key", "seconds")}
+    out.write(_marker_path(name, stage), json.dumps(told).encode())
+
+
+def _marker_path(name: str, stage: str) -> str:
+    return f"{name}/{MARKERS}/{quote(stage, safe=' ')}.json"
+
+
+def perform(recipe: Recipe, entry: Entry, stage: Stage, out_url: str) -> Marker:
+    """Run a stage, keep its result, then its marker. Whatever happens is in the marker that is returned.
+
+    A result that is there already, as of a task that an engine starts twice, is not made again.
+    """
+    start, out = time.perf_counter(), open_storage(out_url)
+    try:
+        earlier = read_marker(out, entry.name, stage.name)
+        if earlier is not None and earlier.is_whole(stage.key, out.files(entry.name)):
+            return earlier
+        with _scratch() as scratch:
+            work = Work(entry, out, scratch / "bundle")
+            work.folder.mkdir()
+            outcome, kept = recipe.run(stage.name, work)
+            out.remove(_marker_path(entry.name, stage.name))  # its files change now
+            files = publish(out, work.folder, kept, entry.name)
+        marker = Marker(stage.key, _since(start), outcome, files)
+    except InputError as error:
+        marker = Marker(stage.key, _since(start), failed=str(error), kind="input")
+    except Exception as error:
+        words = str(error).strip().splitlines() or [""]
+        reason = f"{type(error).__name__}: {words[-1]}"[:500]
+        marker = Marker(stage.key, _since(start), failed=reason, kind="crash", trace=traceback.format_exc())
+    try:
+        write_marker(out, entry.name, stage.name, marker)
+    except Exception as error:  # the disk is full, the store is away
+        reason = f"{type(error).__name__}: {error}"
+        return Marker(stage.key, _since(start), failed=reason, kind="crash", trace=traceback.format_exc())
+    return marker
+
+
+def _since(start: float) -> float:
+    return round(time.perf_counter() - start, 3)
+
+
+@contextmanager
+def _scratch() -> Iterator[Path]:
+    """A folder of this process. Those of processes that were killed are removed."""
+    for left in Path(tempfile.gettempdir()).glob("splatart-batch-*-*"):
+        pid = left.name.split("-")[2]
+        if pid.isdecimal() and not os.path.exists(f"/proc/{pid}") and os.path.exists("/proc/self"):
+            shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=f"splatart-batch-{os.getpid()}-") as folder:
+        yield Path(folder)

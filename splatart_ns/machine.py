@@ -1,0 +1,36 @@
+"""What this machine lends to a computation."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+
+
+def num_cores() -> int:
+    """Cores that this process may use: OMP_NUM_THREADS where it is set, else those it is bound to."""
+    threads = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]  # "4,2" is for nested regions
+    if threads.isdigit():
+        return max(1, int(threads))
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def memory_mb() -> int:
+    """Memory of this machine, or of the container that this process runs in, in MiB."""
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    limit = _CGROUP_LIMIT.read_text().strip() if _CGROUP_LIMIT.is_file() else ""
+    return (min(memory, int(limit)) if limit.isdigit() else memory) // 2**20
+
+
+def num_gpus() -> int:
+    """CUDA devices that this process may use, found without loading CUDA."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if visible is not None:
+        return len([name for name in visible.split(",") if name.strip() not in ("", "-1")])
+    if shutil.which("nvidia-smi") is None:
+        return 0
+    listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
+    return sum(line.startswith("GPU ") for line in listed.stdout.splitlines())
