@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable
 from typing import Any
+from urllib.parse import urlsplit
 
 from splatart_ns.batch.pool import THREADS, Death
 from splatart_ns.batch.stage import Needs
@@ -29,9 +31,10 @@ class RayCluster:
             raise InputError("--address needs Ray; `pip install 'splatart-ns[ray]'`.") from None
         self._ray = ray
         try:
+            _knock(address)
             ray.init(address=address, log_to_driver=False, logging_level="ERROR", runtime_env={"env_vars": THREADS})
-        except (ConnectionError, ValueError, RuntimeError) as error:
-            reason = str(error).strip().splitlines()[0]
+        except (OSError, ValueError, RuntimeError) as error:
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
             raise InputError(f"--address {address}: no Ray cluster can be used there ({reason}).") from None
         self._task = ray.remote(_call)
         self._tickets: dict[Any, Any] = {}
@@ -78,6 +81,13 @@ class RayCluster:
         for reference in self._tickets:
             self._ray.cancel(reference, force=True)
         self._ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """Raise OSError where nothing listens: Ray tries for minutes, and then ends the process."""
+    parts = urlsplit(address if "://" in address else f"//{address}")
+    if parts.port is not None:
+        socket.create_connection((parts.hostname, parts.port), timeout=10).close()
 
 
 def _call(function: Callable, *arguments: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import uuid
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -112,7 +113,7 @@ class Folder:
         # Linked when it is whole: nobody reads an empty claim.
         target = Path(self.url, path)
         target.parent.mkdir(parents=True, exist_ok=True)
-        whole = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+        whole = target.with_name(f".{uuid.uuid4().hex}.tmp")
         whole.write_bytes(data)
         try:
             os.link(whole, target)

@@ -1,0 +1,63 @@
+"""The same on a Ray cluster, of which a node may go."""
+
+import pytest
+from stub_recipe import StubRecipe
+
+from splatart_ns.batch.cluster import RayCluster
+from splatart_ns.errors import InputError
+
+ray = pytest.importorskip("ray", reason="Ray is not installed: extra 'ray'")
+
+
+@pytest.fixture
+def two_nodes(monkeypatch):
+    """A local cluster of a head and another node, a core each."""
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("RAY_DISABLE_MEMORY_MONITOR", "1")
+    try:
+        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+        other = cluster.add_node(num_cpus=1)
+    except Exception as error:  # Ray raises many types
+        pytest.skip(f"Ray cannot start here: {error}")
+    yield cluster, other
+    ray.shutdown()
+    cluster.shutdown()
+
+
+def contents(folder):
+    """Of all bundles; seconds differ."""
+    return {
+        file.relative_to(folder): file.read_bytes()
+        for file in folder.glob("*/**/*")
+        if file.is_file() and file.parent.name != "stages"
+    }
+
+
+def test_a_node_that_dies_changes_nothing(two_nodes, captures, run, tmp_path, log):
+    cluster, other = two_nodes
+    entries = captures(*(f"object {number}" for number in range(12)))
+    seen = []
+
+    class Watched(RayCluster):
+        def wait(self, seconds):
+            ended = super().wait(seconds)
+            seen.extend(ended)
+            if len(seen) >= 10 and other in cluster.list_all_nodes():
+                cluster.remove_node(other, allow_graceful=False)
+            return ended
+
+    recipe = StubRecipe(str(tmp_path / "log"), seconds=0.05)
+    told = run(entries, recipe=recipe, engine=Watched(cluster.address))
+    assert other not in cluster.list_all_nodes()
+    assert set(told.status().values()) == {"done"} and len(told.rows) == 12
+    assert set(log()) == {
+        f"object {n} {stage}" for n in range(12) for stage in ("look", "copy one", "copy two", "join")
+    }
+    run(entries, tmp_path / "here", StubRecipe())
+    assert contents(tmp_path / "out") == contents(tmp_path / "here")
+
+
+def test_an_address_where_nothing_is(monkeypatch):
+    with pytest.raises(InputError, match="127.0.0.1:1"):
+        RayCluster("127.0.0.1:1")

@@ -1,0 +1,125 @@
+"""Which captures a batch is of."""
+
+import json
+
+import pytest
+
+from splatart_ns.batch.entry import read_entries
+from splatart_ns.errors import InputError
+
+SETTINGS = {"quality": "standard", "root": None, "seed": 0, "joints": []}
+
+
+@pytest.fixture
+def make(tmp_path):
+    def make(path, text="{}"):
+        file = tmp_path / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+
+    return make
+
+
+def names(source):
+    return [entry.name for entry in read_entries(str(source), SETTINGS)]
+
+
+def test_captures_of_all_layouts_are_found(make, tmp_path):
+    for state in ("state_00", "state_01", "eval/novel_00"):
+        make(f"kitchen/drawer/{state}/transforms.json", '{"frames": []}')
+    make("one_file/transforms.json", '{"frames": [{"state": 0}]}')
+    make("one_file/eval/novel_00/transforms.json", "{}")
+    for state in ("start", "end"):
+        make(f"paris/{state}/camera_train.json")
+    make("notes/readme.json")
+    make(".hidden/transforms.json", '{"frames": [{"state": 0}]}')
+    entries = read_entries(str(tmp_path), SETTINGS)
+    assert [entry.name for entry in entries] == ["kitchen/drawer", "one_file", "paris"]
+    assert entries[0].capture == str(tmp_path / "kitchen/drawer") and entries[0].settings == SETTINGS
+
+
+def test_a_broken_file_among_captures_is_one_of_them(make, tmp_path):
+    for name in ("a", "b"):
+        make(f"{name}/transforms.json", '{"frames": [{"state": 0}]}')
+    make("broken/transforms.json", '{"fra')
+    assert names(tmp_path) == ["a", "b", "broken"]
+
+
+def test_the_folder_may_be_a_capture_itself(make, tmp_path):
+    make("scissors/state_00/transforms.json")
+    assert names(tmp_path / "scissors") == ["scissors"]
+
+
+@pytest.mark.parametrize("content", [None, "notes/readme.txt"])
+def test_no_capture_at_all_is_a_mistake(make, tmp_path, content):
+    if content is not None:
+        make(content)
+    with pytest.raises(InputError, match="no capture"):
+        names(tmp_path / "notes")
+
+
+def test_captures_in_an_object_store_are_found(object_store):
+    import fsspec
+
+    store = fsspec.filesystem("s3")
+    for name in ("a/state_00", "a/state_01", "deep/b/state_00"):
+        store.pipe_file(f"bucket/found/{name}/transforms.json", b"{}")
+    entries = read_entries(f"{object_store}/found", SETTINGS)
+    assert [(entry.name, entry.capture) for entry in entries] == [
+        ("a", "s3://bucket/found/a"),
+        ("deep/b", "s3://bucket/found/deep/b"),
+    ]
+
+
+def test_a_csv_says_what_is_special_about_an_object(make, tmp_path):
+    make(
+        "list.csv", "path,name,quality,root,seed,joints\ncaps/a,,,,,\n/b,bee,draft,base,7,lid:base=revolute; knob:lid\n"
+    )
+    first, second = read_entries(str(tmp_path / "list.csv"), SETTINGS)
+    assert (first.name, first.capture, first.settings) == ("a", f"{tmp_path}/caps/a", SETTINGS)
+    assert (second.name, second.capture) == ("bee", "/b")
+    joints = ["lid:base=revolute", "knob:lid"]
+    assert second.settings == {"quality": "draft", "root": "base", "seed": 7, "joints": joints}
+
+
+def test_json_lines_do_so_too(make, tmp_path):
+    rows = [{"path": "s3://bucket/a"}, {"path": "b", "name": "x/y", "joints": ["lid:base"]}]
+    make("list.jsonl", "\n".join(map(json.dumps, rows)) + "\n\n")
+    first, second = read_entries(str(tmp_path / "list.jsonl"), SETTINGS)
+    assert (first.name, first.capture) == ("a", "s3://bucket/a")
+    assert (second.name, second.settings["joints"]) == ("x/y", ["lid:base"])
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("path\n", "no capture"),
+        ("name\na\n", "line 2: 'path' is missing"),
+        ("path,colour\na,red\n", "line 2: 'colour' is unknown"),
+        ("path,seed\na,-1\n", "line 2: 'seed' is '-1'"),
+        ("path,quality\na,best\n", "'best'; give one of draft, standard, high"),
+        ("path,name\na\n", "line 2: has not as many fields"),
+        ('path\n"a\n', "is no CSV"),
+        ("path\nx/a\ny/a\n", "both 'a' and 'a'"),
+        ("path,name\na,A\nb,a\n", "both 'A' and 'a'"),
+        ("path,name\na,../a\n", "'../a'"),
+        ("path,name\na,/etc\n", "'/etc'"),
+        ("path,name\na,.batch\n", "'.batch'"),
+        ("path,name\na,x\nb,x/runs\n", "'x/runs'"),
+        ("path,name\na,x\nb,x/y\n", "'x/y' would lie in the bundle 'x'"),
+    ],
+)
+def test_a_manifest_with_a_mistake_names_the_line_and_the_mend(make, tmp_path, text, told):
+    make("list.csv", text)
+    with pytest.raises(InputError) as raised:
+        names(tmp_path / "list.csv")
+    assert told in str(raised.value) and str(raised.value).startswith(str(tmp_path / "list.csv"))
+
+
+@pytest.mark.parametrize(
+    "line", ["[1]", "{", '{"path": 3}', '{"path": "a", "joints": "lid"}', '{"path": "a", "seed": true}']
+)
+def test_a_line_that_is_no_object_or_has_a_wrong_value_is_named(make, tmp_path, line):
+    make("list.jsonl", '{"path": "fine"}\n' + line)
+    with pytest.raises(InputError, match="line 2"):
+        names(tmp_path / "list.jsonl")

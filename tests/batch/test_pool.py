@@ -1,0 +1,76 @@
+"""Processes of this machine."""
+
+import os
+import time
+
+import pytest
+
+from splatart_ns.batch.pool import Death, ProcessPool
+from splatart_ns.batch.stage import Needs
+
+
+@pytest.fixture
+def pool():
+    pools = []
+
+    def make(*arguments):
+        pools.append(ProcessPool(*arguments))
+        return pools[-1]
+
+    yield make
+    for one in pools:
+        one.close()
+
+
+def results(pool, count):
+    ended = []
+    while len(ended) < count:
+        ended += pool.wait(10.0)
+    return dict(ended)
+
+
+def test_results_come_with_their_tickets(pool):
+    pool = pool(2, 1000, 0)
+    pool.start("a", Needs(), pow, 2, 5)
+    pool.start("b", Needs(), pow, 3, 2)
+    assert not pool.fits(Needs())
+    assert results(pool, 2) == {"a": 32, "b": 9}
+    assert pool.wait(0.0) == []
+
+
+def test_a_task_waits_until_its_memory_is_free_and_starts_at_last(pool):
+    pool = pool(4, 1000, 0)
+    pool.start("a", Needs(memory_mb=700), abs, 1)
+    assert pool.fits(Needs(memory_mb=300)) and not pool.fits(Needs(memory_mb=301))
+    results(pool, 1)
+    assert pool.fits(Needs(memory_mb=5000))  # more than there is: alone
+
+
+def test_a_process_that_dies_takes_its_own_task_alone(pool):
+    pool = pool(2, 1000, 0)
+    pool.start("ends", Needs(), os._exit, 7)
+    pool.start("sleeps", Needs(), time.sleep, 0.2)
+    ended = results(pool, 2)
+    assert ended["sleeps"] is None
+    assert isinstance(ended["ends"], Death) and "exit code 7" in str(ended["ends"])
+    pool.start("next", Needs(), abs, -1)
+    assert results(pool, 1) == {"next": 1}
+
+
+def test_each_gpu_belongs_to_one_process(pool):
+    pool = pool(3, 10000, 2)
+    on_gpu = Needs(gpu=True)
+    for ticket in ("a", "b"):
+        pool.start(ticket, on_gpu, os.getenv, "CUDA_VISIBLE_DEVICES")
+    assert not pool.fits(on_gpu) and pool.fits(Needs())
+    pool.start("cpu", Needs(), os.getenv, "CUDA_VISIBLE_DEVICES")
+    ended = results(pool, 3)
+    assert {ended["a"], ended["b"]} == {"0", "1"} and ended["cpu"] == ""
+
+
+def test_the_gpus_that_the_user_grants(pool, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    pool = pool(1, 10000, None)
+    pool.start("a", Needs(gpu=True), os.getenv, "CUDA_VISIBLE_DEVICES")
+    assert results(pool, 1) == {"a": "3"}
+    assert pool.fits(Needs())  # its one process takes what needs no GPU, too
