@@ -11,6 +11,7 @@ import uuid
 from urllib.parse import quote
 
 from splatart_ns.batch.storage import Storage
+from splatart_ns.machine import process_lives
 
 _CLAIMS, _SESSIONS = ".batch/claims", ".batch/sessions"
 _BEAT = 20.0
@@ -79,7 +80,7 @@ class Session:
         if data is None:
             return False
         told = json.loads(data)
-        if told["host"] == socket.gethostname() and not _process_lives(told["pid"]):
+        if told["host"] == socket.gethostname() and not process_lives(told["pid"]):
             return False
         return time.time() - told["time"] < _DEAD
 
@@ -97,13 +98,3 @@ class Session:
 
 def _path(name: str, number: int) -> str:
     return f"{_CLAIMS}/{quote(name, safe='')}.{number}"
-
-
-def _process_lives(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True

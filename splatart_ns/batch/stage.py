@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Protocol
 from urllib.parse import quote
@@ -19,7 +20,9 @@ from urllib.parse import quote
 from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.storage import FileInfo, Folder, Storage, open_storage, publish
 from splatart_ns.errors import InputError
+from splatart_ns.machine import process_lives
 
+_SCRATCH = "splatart-batch-"
 MARKERS = "stages"
 """Folder in a bundle of a file per stage that says how it ended."""
 
@@ -208,10 +211,16 @@ def _since(start: float) -> float:
 
 @contextmanager
 def _scratch() -> Iterator[Path]:
-    """A folder of this process. Those of processes that were killed are removed."""
-    for left in Path(tempfile.gettempdir()).glob("splatart-batch-*-*"):
-        pid = left.name.split("-")[2]
-        if pid.isdecimal() and not os.path.exists(f"/proc/{pid}") and os.path.exists("/proc/self"):
-            shutil.rmtree(left, ignore_errors=True)
-    with tempfile.TemporaryDirectory(prefix=f"splatart-batch-{os.getpid()}-") as folder:
+    """A folder of this process."""
+    _remove_scratch_of_the_dead()
+    with tempfile.TemporaryDirectory(prefix=f"{_SCRATCH}{os.getpid()}-") as folder:
         yield Path(folder)
+
+
+@cache
+def _remove_scratch_of_the_dead() -> None:
+    """Once a process: remove what processes that were killed have left."""
+    for left in Path(tempfile.gettempdir()).glob(f"{_SCRATCH}*-*"):
+        pid = left.name.removeprefix(_SCRATCH).split("-")[0]
+        if pid.isdecimal() and not process_lives(int(pid)):
+            shutil.rmtree(left, ignore_errors=True)

@@ -1,0 +1,129 @@
+"""`splatart batch` of real captures."""
+
+import csv
+import json
+import shutil
+
+import pytest
+
+from splatart_ns.batch.entry import Entry
+from splatart_ns.batch.fitting import Fitting
+
+SETTINGS = {"quality": "draft", "root": None, "seed": 0, "joints": []}
+
+
+@pytest.fixture(scope="module")
+def fitted(hinge_capture, start_splatart, tmp_path_factory):
+    """A batch of a capture, one that is corrupt and one that cannot be fitted; the folder and the process."""
+    folder = tmp_path_factory.mktemp("batch")
+    for name in ("corrupt", "hinge", "still"):
+        shutil.copytree(hinge_capture, folder / "captures" / name)
+    image = folder / "captures/corrupt/state_01/images/0002.png"
+    image.write_bytes(image.read_bytes()[:300])
+    shutil.rmtree(folder / "captures/still/state_01")
+    arguments = ("batch", folder / "captures", "--output-dir", folder / "out", "--quality", "draft", "--export", "ply")
+    process = start_splatart(*arguments)
+    process.told, process.errors = process.communicate()
+    return folder, process
+
+
+def rows(folder):
+    with open(folder / "out/report.csv", newline="") as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
+
+
+def test_the_bundle_is_that_of_a_single_fit_bit_for_bit(fitted, hinge_fit):
+    folder, process = fitted
+    assert process.errors == ""
+    bundle = folder / "out/hinge"
+    assert (bundle / "articulation.json").read_bytes() == (hinge_fit / "articulation.json").read_bytes()
+    for ply in (hinge_fit / "parts").iterdir():
+        assert (bundle / "parts" / ply.name).read_bytes() == ply.read_bytes()
+    assert (bundle / "export/ply/export.json").exists()
+
+
+def test_captures_that_cannot_be_fitted_are_told_with_their_reasons(fitted):
+    folder, process = fitted
+    assert process.returncode == 3
+    assert "1 of 3 objects done, 2 failed" in process.told
+    found = rows(folder)
+    assert {name: row["status"] for name, row in found.items()} == {
+        "corrupt": "failed", "hinge": "done", "still": "failed",
+    }  # fmt: skip
+    assert "state_01/images/0002.png: the image is cut off" in found["corrupt"]["reason"]
+    assert "there is only the state state_00" in found["still"]["reason"]
+    assert found["hinge"]["joints"] == "lid:base=revolute"
+
+
+def test_the_report_shows_two_pictures(fitted):
+    folder, _ = fitted
+    assert (folder / "out/report.html").read_text().count("data:image/jpeg;base64,") == 2
+
+
+def test_a_second_run_leaves_it_alone_and_says_the_same(fitted, run_main):
+    folder, _ = fitted
+    before = {file: file.stat().st_mtime_ns for file in (folder / "out/hinge").rglob("*") if file.is_file()}
+    arguments = ("--output-dir", folder / "out", "--quality", "draft", "--export", "ply")
+    code, told, _ = run_main("batch", folder / "captures", *arguments)
+    assert code == 3 and "1 of 3 objects done, 2 failed" in told
+    assert {file: file.stat().st_mtime_ns for file in before} == before
+    assert len(before) == sum(1 for file in (folder / "out/hinge").rglob("*") if file.is_file())
+
+
+def test_fit_goes_on_from_what_a_batch_left(fitted, run_main, tmp_path):
+    folder, _ = fitted
+    bundle = folder / "out/hinge"
+    report = json.loads((bundle / "report.json").read_text())
+    assert [stage["name"] for stage in report["stages"]] == ["semantic state_00", "semantic state_01", "pose", "joint"]
+    before = (bundle / "articulation.json").stat().st_mtime_ns
+    code, _, _ = run_main("fit", folder / "captures/hinge", "--output-dir", bundle, "--quality", "draft")
+    assert code == 0 and (bundle / "articulation.json").stat().st_mtime_ns == before
+
+
+def test_nerfstudio_opens_the_runs_where_they_lie(fitted):
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    folder, _ = fitted
+    run = folder / "out/hinge/runs/all/splatart-joint/fit"
+    _, _, checkpoint, _ = eval_setup(run / "config.yml")
+    assert checkpoint.parent.parent == run
+
+
+def stages(settings, told, **recipe):
+    return {stage.name: stage for stage in Fitting(**recipe).stages(Entry("a", "", SETTINGS | settings), "files", told)}
+
+
+def test_what_depends_on_a_setting_or_a_state_has_another_key():
+    told = {"digest": "all", "states": [{"name": n, "digest": n, "pixels": 10**6} for n in ("s0", "s1")]}
+    other_state = {"digest": "new", "states": [told["states"][0], told["states"][1] | {"digest": "new"}]}
+    first = stages({}, told, exports=("urdf",))
+
+    def changed(settings, told):
+        return {
+            name for name, stage in stages(settings, told, exports=("urdf",)).items() if stage.key != first[name].key
+        }
+
+    last = {"joint", "export urdf", "summary"}
+    assert changed({}, told) == set()
+    assert changed({"root": "lid"}, told) == last | {"check"}
+    assert changed({"seed": 1}, told) == last | {"semantic s0", "semantic s1", "pose"}
+    assert changed({}, other_state) == last | {"semantic s1", "pose"}
+    assert first["pose"].after == ("semantic s0", "semantic s1") and first["semantic s0"].after == ("check",)
+    assert first["semantic s0"].needs.gpu and not first["joint"].needs.gpu
+    assert first["pose"].needs.memory_mb > first["semantic s0"].needs.memory_mb
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["nowhere"], "no capture"),
+        (["list.csv"], "cannot be read"),
+        (["nowhere", "--seed", "-1"], "--seed is -1"),
+        (["nothing://bucket"], "nothing://bucket"),
+    ],
+)
+def test_a_mistake_in_what_was_asked_is_one_sentence(run_main, tmp_path, monkeypatch, arguments, told):
+    monkeypatch.chdir(tmp_path)
+    code, _, errors = run_main("batch", *arguments, "--output-dir", tmp_path / "out")
+    assert code == 2 and told in errors and errors.count("\n") == 1
+    assert not (tmp_path / "out").exists()
