@@ -86,7 +86,8 @@ def _holds_states(data: bytes | None) -> bool:
 
 def _read_manifest(source: str, settings: dict[str, Any]) -> list[Entry]:
     folder, _, name = source.rpartition("/")
-    data = open_storage(folder or ".").read(name)
+    storage = open_storage(folder or ("/" if source.startswith("/") else "."))
+    data = storage.read(name)
     if data is None:
         raise InputError(f"{source}: cannot be read; give a .csv or .jsonl file.")
     try:
@@ -94,7 +95,7 @@ def _read_manifest(source: str, settings: dict[str, Any]) -> list[Entry]:
     except UnicodeDecodeError:
         raise InputError(f"{source}: is not UTF-8; save it again as UTF-8.") from None
     rows = _csv_rows(source, text) if source.lower().endswith(".csv") else _json_rows(source, text)
-    return [_entry(f"{source}, line {line}", row, folder or ".", settings) for line, row in rows]
+    return [_entry(f"{source}, line {line}", row, storage.url, settings) for line, row in rows]
 
 
 def _csv_rows(source: str, text: str) -> Iterable[tuple[int, dict[str, Any]]]:

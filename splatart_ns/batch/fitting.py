@@ -20,7 +20,6 @@ from splatart_ns.files import write_json
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
-    from splatart_ns.capture.capture import Capture
     from splatart_ns.plugin.fit import Settings
 
 _BASE_MB = 1100
@@ -119,7 +118,7 @@ def _check(work: Work, settings: Settings) -> dict[str, Any]:
 def _train(work: Work, stage: str, settings: Settings) -> tuple[dict[str, Any], list[str]]:
     """A stage of the fit, from the runs that earlier ones have left."""
     from splatart_ns.capture.formats import load_capture
-    from splatart_ns.plugin.fit import stage_configs
+    from splatart_ns.plugin.fit import report_head, stage_configs
     from splatart_ns.plugin.stage_run import run_stage
 
     with work.capture() as path:
@@ -136,7 +135,8 @@ def _train(work: Work, stage: str, settings: Settings) -> tuple[dict[str, Any], 
         kept = [_run_folder(configs[stage], work.folder)]
         if stage == "joint":
             done = {name: work.outcome(name) for name in configs if name != stage} | {stage: outcome}
-            _write_report(work.folder / "report.json", capture, settings, done)
+            told = report_head(capture, settings) | {"capture": work.entry.capture, **_stages_of_report(done)}
+            write_json(work.folder / "report.json", told)
             kept += ["report.json", "parts", "articulation.json"]
     return outcome, kept
 
@@ -152,13 +152,10 @@ def _write_config(config: TrainerConfig, path: Path) -> None:
     path.write_text(yaml.dump(config), encoding="utf-8")
 
 
-def _write_report(path: Path, capture: Capture, settings: Settings, stages: dict[str, dict[str, Any]]) -> None:
-    """As `splatart fit` does, which can go on from it."""
-    from splatart_ns.plugin.fit import report_head
-
-    told = [{"name": name, "wall_seconds": outcome["seconds"], **outcome} for name, outcome in stages.items()]
-    seconds = round(sum(stage["seconds"] for stage in told), 2)
-    write_json(path, report_head(capture, settings) | {"stages": told, "seconds": seconds})
+def _stages_of_report(outcomes: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """As `splatart fit` tells them, which can go on from there."""
+    told = [{"name": name, "wall_seconds": outcome["seconds"], **outcome} for name, outcome in outcomes.items()]
+    return {"stages": told, "seconds": round(sum(stage["seconds"] for stage in told), 2)}
 
 
 def _export(work: Work, form: str) -> tuple[dict[str, Any], list[str]]:

@@ -55,6 +55,8 @@ class Marker:
 
     key: str
     seconds: float
+    cpu_seconds: float = 0.0
+    """Of all threads of its process; on a busy machine less than `seconds`."""
     outcome: dict[str, Any] = field(default_factory=dict)
     files: dict[str, int] = field(default_factory=dict)
     """Size of every file it left, by its name in the bundle."""
@@ -131,11 +133,13 @@ class Work:
             yield Path(storage.url)
             return
         with tempfile.TemporaryDirectory(dir=self.folder.parent) as copy:
-            # Under its own name, which messages about its files begin with.
-            folder = Path(copy, self.entry.capture.rstrip("/").rsplit("/", 1)[-1])
+            folder = Path(copy, "capture")
             folder.mkdir()
             storage.get("", folder)
-            yield folder
+            try:
+                yield folder
+            except InputError as error:
+                raise InputError(str(error).replace(str(folder), self.entry.capture)) from None
 
 
 def stage_key(*inputs: Any) -> str:
@@ -179,7 +183,7 @@ def perform(recipe: Recipe, entry: Entry, stage: Stage, out_url: str) -> Marker:
 
     A result that is there already, as of a task that an engine starts twice, is not made again.
     """
-    start, out = time.perf_counter(), open_storage(out_url)
+    clock, out = _Clock(), open_storage(out_url)
     try:
         earlier = read_marker(out, entry.name, stage.name)
         if earlier is not None and earlier.is_whole(stage.key, out.files(entry.name)):
@@ -190,23 +194,29 @@ def perform(recipe: Recipe, entry: Entry, stage: Stage, out_url: str) -> Marker:
             outcome, kept = recipe.run(stage.name, work)
             out.remove(_marker_path(entry.name, stage.name))  # its files change now
             files = publish(out, work.folder, kept, entry.name)
-        marker = Marker(stage.key, _since(start), outcome, files)
+        marker = Marker(stage.key, **clock.taken(), outcome=outcome, files=files)
     except InputError as error:
-        marker = Marker(stage.key, _since(start), failed=str(error), kind="input")
+        marker = Marker(stage.key, **clock.taken(), failed=str(error), kind="input")
     except Exception as error:
         words = str(error).strip().splitlines() or [""]
         reason = f"{type(error).__name__}: {words[-1]}"[:500]
-        marker = Marker(stage.key, _since(start), failed=reason, kind="crash", trace=traceback.format_exc())
+        marker = Marker(stage.key, **clock.taken(), failed=reason, kind="crash", trace=traceback.format_exc())
     try:
         write_marker(out, entry.name, stage.name, marker)
     except Exception as error:  # the disk is full, the store is away
         reason = f"{type(error).__name__}: {error}"
-        return Marker(stage.key, _since(start), failed=reason, kind="crash", trace=traceback.format_exc())
+        return Marker(stage.key, **clock.taken(), failed=reason, kind="crash", trace=traceback.format_exc())
     return marker
 
 
-def _since(start: float) -> float:
-    return round(time.perf_counter() - start, 3)
+class _Clock:
+    def __init__(self):
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def taken(self) -> dict[str, float]:
+        """Of a marker."""
+        wall, cpu = time.perf_counter() - self._wall, time.process_time() - self._cpu
+        return {"seconds": round(wall, 3), "cpu_seconds": round(cpu, 3)}
 
 
 @contextmanager
