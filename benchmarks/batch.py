@@ -29,7 +29,7 @@ from splatart_ns.batch.entry import Entry, read_entries
 from splatart_ns.batch.fitting import Fitting
 from splatart_ns.batch.pool import ProcessPool
 from splatart_ns.batch.report import Report
-from splatart_ns.batch.stage import Needs, Stage, Work, stage_key
+from splatart_ns.batch.stage import Needs, Stage, Work, fingerprint, stage_key
 from splatart_ns.batch.storage import open_storage
 
 SPLATART = [sys.executable, "-c", "from splatart_ns.cli import main; main()"]
@@ -38,6 +38,9 @@ SPLATART = [sys.executable, "-c", "from splatart_ns.cli import main; main()"]
 @dataclass(frozen=True)
 class Tiny:
     """Six stages as those of a fit, which write a line each."""
+
+    def fingerprint(self, entry: Entry) -> str:
+        return fingerprint(entry.capture)
 
     def stages(self, entry: Entry, fingerprint: str, told: dict[str, Any] | None) -> list[Stage]:
         tiny = Needs(memory_mb=1)

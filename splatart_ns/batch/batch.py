@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from splatart_ns.batch.claim import Session
 from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.pool import Death, Engine
-from splatart_ns.batch.stage import Marker, Needs, Recipe, Stage, fingerprint, perform, read_marker, write_marker
+from splatart_ns.batch.stage import Marker, Needs, Recipe, Stage, perform, read_marker, write_marker
 from splatart_ns.batch.storage import Storage, open_storage
 from splatart_ns.errors import InputError
 
@@ -182,7 +182,7 @@ class _Batch:
         """An object, and what earlier runs have left of it."""
         thing = _Object(index, entry)
         try:
-            thing.fingerprint = fingerprint(entry.capture)
+            thing.fingerprint = self._recipe.fingerprint(entry)
             files = self._out.files(entry.name)
             self._plan(thing)
             self._read(thing, files)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatart_ns.batch.entry import Entry
-from splatart_ns.batch.stage import Needs, Stage, Work, stage_key
+from splatart_ns.batch.stage import Needs, Stage, Work, fingerprint, stage_key
 from splatart_ns.errors import InputError
 from splatart_ns.files import write_json
 
@@ -36,6 +36,9 @@ class Fitting:
 
     rasterizer: str = "auto"
     exports: tuple[str, ...] = ()
+
+    def fingerprint(self, entry: Entry) -> str:
+        return fingerprint(entry.capture)
 
     def stages(self, entry: Entry, fingerprint: str, told: dict[str, Any] | None) -> list[Stage]:
         package, settings = version("splatart-ns"), entry.settings

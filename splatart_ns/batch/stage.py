@@ -78,11 +78,11 @@ class Marker:
 class Recipe(Protocol):
     """What is done with every object. It is pickled: workers get a copy."""
 
-    def stages(self, entry: Entry, fingerprint: str, told: dict[str, Any] | None) -> list[Stage]:
-        """All stages, two or more, in order; only the first while what it tells (its outcome) is not known.
+    def fingerprint(self, entry: Entry) -> str:
+        """Changes with any input file; found without reading them. Raises InputError where there is none."""
 
-        `fingerprint` changes with any file of the capture.
-        """
+    def stages(self, entry: Entry, fingerprint: str, told: dict[str, Any] | None) -> list[Stage]:
+        """All stages, two or more, in order; only the first while what it tells (its outcome) is not known."""
 
     def run(self, stage: str, work: Work) -> tuple[dict[str, Any], Sequence[str]]:
         """Do a stage in `work.folder`; returns its outcome, and the files or folders in it to keep, the last one last.

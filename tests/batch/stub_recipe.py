@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatart_ns.batch.stage import Needs, Stage, stage_key
+from splatart_ns.batch.stage import Needs, Stage, fingerprint, stage_key
 from splatart_ns.errors import InputError
 
 
@@ -21,6 +21,9 @@ class StubRecipe:
     """File that gets a line whenever a stage has left its result."""
     seconds: float = 0.0
     """What each stage takes."""
+
+    def fingerprint(self, entry):
+        return fingerprint(entry.capture)
 
     def stages(self, entry, fingerprint, told) -> list[Stage]:
         look = Stage("look", stage_key("look", fingerprint))

@@ -1,5 +1,8 @@
 """The same on a Ray cluster, of which a node may go."""
 
+import contextlib
+import time
+
 import pytest
 from stub_recipe import StubRecipe
 
@@ -14,7 +17,16 @@ def two_nodes(monkeypatch):
     """A local cluster of a head and another node, a core each."""
     from ray.cluster_utils import Cluster
 
-    monkeypatch.setenv("RAY_DISABLE_MEMORY_MONITOR", "1")
+    known = ray._private.services.get_node
+
+    def patient(*arguments):  # Ray gives a node 30 seconds to start, which on a busy machine are too few
+        for _ in range(120):
+            with contextlib.suppress(RuntimeError):
+                return known(*arguments)
+            time.sleep(1)
+        return known(*arguments)
+
+    monkeypatch.setattr(ray._private.services, "get_node", patient)
     try:
         cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
         other = cluster.add_node(num_cpus=1)
