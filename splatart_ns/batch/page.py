@@ -32,7 +32,8 @@ th button:focus-visible { outline: 2px solid; }
 th[aria-sort=ascending] button::after { content: " \\25b2"; }
 th[aria-sort=descending] button::after { content: " \\25bc"; }
 td.number { text-align: right; font-variant-numeric: tabular-nums; }
-td.long { max-width: 34em; overflow-wrap: anywhere; }
+td.long { max-width: 34em; overflow-wrap: break-word; }
+td.pictures { white-space: nowrap; }
 td img { background: #fff; border-radius: 3px; margin-right: 3px; }
 .failed { color: #c0392b; font-weight: 600; }
 .unfinished { color: #b07d00; }
@@ -101,7 +102,7 @@ def _row(row: dict[str, Any], pictured: bool) -> str:
         wrong.append(f"{row['unattached']} parts hang on nothing")
     cells = [
         _cell(row["name"], escape(row["name"]), "long"),
-        f"<td>{pictures}</td>",
+        f'<td class="pictures">{pictures}</td>',
         _cell(row["status"], f'<span class="{row["status"]}">{row["status"]}</span>'),
         _cell(len(joints) if row["status"] == "done" else "", _joint_list(row, joints), "long"),
         _number(residual, ".2g", " " + row.get("length_unit", "")),

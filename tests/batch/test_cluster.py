@@ -1,6 +1,7 @@
 """The same on a Ray cluster, of which a node may go."""
 
 import contextlib
+import socket
 import time
 
 import pytest
@@ -28,13 +29,23 @@ def two_nodes(monkeypatch):
 
     monkeypatch.setattr(ray._private.services, "get_node", patient)
     try:
-        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-        other = cluster.add_node(num_cpus=1)
+        cluster = Cluster(initialize_head=True, head_node_args={"include_dashboard": False, **one_core()})
+        other = cluster.add_node(**one_core())
     except Exception as error:  # Ray raises many types
         pytest.skip(f"Ray cannot start here: {error}")
     yield cluster, other
     ray.shutdown()
     cluster.shutdown()
+
+
+def one_core():
+    """A node that does not wait for its agents to tell which ports they took, for which Ray has 30 seconds, too."""
+    agents = ("runtime_env_agent", "metrics_agent", "metrics_export", "dashboard_agent_listen")
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in agents]
+    ports = {f"{agent}_port": one.getsockname()[1] for agent, one in zip(agents, sockets, strict=True)}
+    for one in sockets:
+        one.close()
+    return {"num_cpus": 1, **ports}
 
 
 def contents(folder):
