@@ -21,6 +21,10 @@ _TASKS_PER_PROCESS = 200
 """Then a fresh process takes over, whatever libraries have piled up in the old one."""
 
 
+_LAST_SECONDS = 5.0
+"""For a process to end by itself."""
+
+
 class Death(Exception):
     """A task's process ended before the task; the message says how."""
 
@@ -133,9 +137,11 @@ class _Worker:
 
     def end(self) -> None:
         if self.process is not None:
+            self.pipe.close()
+            if self.task is None:  # it ends by itself, and tidies up
+                self.process.join(_LAST_SECONDS)
             self.process.kill()  # its files are whole, or its stage is repeated
             self.process.join()
-            self.pipe.close()
             self._words.close()
         self.process = self.task = None
         self._tasks_left = 0

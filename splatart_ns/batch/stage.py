@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import json
 import os
@@ -190,7 +191,6 @@ def perform(recipe: Recipe, entry: Entry, stage: Stage, out_url: str) -> Marker:
             return earlier
         with _scratch() as scratch:
             work = Work(entry, out, scratch / "bundle")
-            work.folder.mkdir()
             outcome, kept = recipe.run(stage.name, work)
             out.remove(_marker_path(entry.name, stage.name))  # its files change now
             files = publish(out, work.folder, kept, entry.name)
@@ -221,16 +221,27 @@ class _Clock:
 
 @contextmanager
 def _scratch() -> Iterator[Path]:
-    """A folder of this process."""
-    _remove_scratch_of_the_dead()
-    with tempfile.TemporaryDirectory(prefix=f"{_SCRATCH}{os.getpid()}-") as folder:
-        yield Path(folder)
+    """This process's folder, with an empty folder `bundle` in it. Folders stay: to remove one can take long."""
+    folder = _scratch_of_process()
+    try:
+        yield folder
+    finally:
+        for place in (folder, folder / "bundle"):
+            for left in place.iterdir():
+                if left.is_dir() and left != folder / "bundle":
+                    shutil.rmtree(left, ignore_errors=True)
+                elif not left.is_dir():
+                    left.unlink()
 
 
 @cache
-def _remove_scratch_of_the_dead() -> None:
-    """Once a process: remove what processes that were killed have left."""
+def _scratch_of_process() -> Path:
+    """A new folder; those that processes which were killed have left are removed."""
     for left in Path(tempfile.gettempdir()).glob(f"{_SCRATCH}*-*"):
         pid = left.name.removeprefix(_SCRATCH).split("-")[0]
         if pid.isdecimal() and not process_lives(int(pid)):
             shutil.rmtree(left, ignore_errors=True)
+    folder = Path(tempfile.mkdtemp(prefix=f"{_SCRATCH}{os.getpid()}-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    (folder / "bundle").mkdir()
+    return folder
