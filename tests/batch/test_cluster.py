@@ -1,5 +1,7 @@
 """The same on a Ray cluster, of which a node may go."""
 
+import socket
+
 import pytest
 from stub_recipe import StubRecipe
 
@@ -15,13 +17,24 @@ def two_nodes():
     from ray.cluster_utils import Cluster
 
     try:
-        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-        other = cluster.add_node(num_cpus=1)
+        light = {"num_cpus": 1, "include_log_monitor": False, "no_monitor": True}
+        cluster = Cluster(initialize_head=True, head_node_args={"include_dashboard": False, **light, **free_ports()})
+        other = cluster.add_node(**light, **free_ports())
     except Exception as error:  # Ray raises many types, as when a busy machine takes more than 30 seconds for it
         pytest.skip(f"Ray cannot start here: {error}")
     yield cluster, other
     ray.shutdown()
     cluster.shutdown()
+
+
+def free_ports():
+    """For a node's agents: it does not wait until they tell which they took."""
+    agents = ("runtime_env_agent", "metrics_agent", "metrics_export", "dashboard_agent_listen")
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in agents]
+    ports = {f"{agent}_port": one.getsockname()[1] for agent, one in zip(agents, sockets, strict=True)}
+    for one in sockets:
+        one.close()
+    return ports
 
 
 def contents(folder):
