@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 import itertools
 import time
 from collections import deque
@@ -16,7 +15,6 @@ from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.pool import Death, Engine
 from splatart_ns.batch.stage import Marker, Needs, Recipe, Stage, perform, read_marker, write_marker
 from splatart_ns.batch.storage import Storage, open_storage
-from splatart_ns.errors import InputError
 
 _LOOKED_AHEAD = 16
 """Objects whose files are listed before their turn: a store answers slowly, but many at a time."""
@@ -93,7 +91,7 @@ class _Batch:
         self._session = Session(out)
         self._active: dict[int, _Object] = {}
         self._ready: list[tuple[int, int, str]] = []
-        """A heap of (object, place of the stage, stage): early objects first, so that whole ones come out soon."""
+        """(object, place of the stage, stage): early objects come first, so that whole ones come out soon."""
         self._postponed: list[tuple[int, Entry]] = []
         self._objects = self._open_all(entries)
 
@@ -115,25 +113,32 @@ class _Batch:
         self._session.end()
 
     def _start_what_fits(self) -> None:
-        while self._engine.fits(Needs(memory_mb=0)):
-            if not self._ready:
-                if not self._admit():
+        while True:
+            item = self._startable()
+            if item is None:
+                idle = any(self._engine.fits(Needs(memory_mb=0, gpu=gpu)) for gpu in (False, True))
+                if self._ready or not idle or not self._admit():
                     return
                 continue
-            index, _, name = self._ready[0]
+            self._ready.remove(item)
+            index, _, name = item
             thing = self._active[index]
-            stage = thing.waiting[name]
-            if not self._engine.fits(stage.needs):
-                return
-            heapq.heappop(self._ready)
-            if thing.failed is not None:  # meanwhile, another stage of it did
-                del thing.waiting[name]
-                continue
-            del thing.waiting[name]
+            stage = thing.waiting.pop(name)
             thing.running.add(name)
             self._watcher.started(thing.entry, name)
             arguments = (self._recipe, thing.entry, stage, self._out.url)
             self._engine.start((index, name), stage.needs, perform, *arguments)
+
+    def _startable(self) -> tuple[int, int, str] | None:
+        """The first stage in order that fits. Of those for a GPU, and of the others, none overtakes another."""
+        waiting = set()
+        for item in sorted(self._ready):
+            needs = self._active[item[0]].waiting[item[2]].needs
+            if needs.gpu not in waiting:
+                if self._engine.fits(needs):
+                    return item
+                waiting.add(needs.gpu)
+        return None
 
     def _admit(self) -> bool:
         """Take up another object; False when there is none now."""
@@ -189,8 +194,8 @@ class _Batch:
             if len(thing.stages) == 1 and thing.stages[0].name in thing.markers:
                 self._plan(thing)
                 self._read(thing, files)
-        except (InputError, OSError) as error:
-            thing.markers[""] = Marker("", 0.0, failed=str(error), kind="input")
+        except Exception as error:  # libraries of stores raise many types
+            thing.markers[""] = Marker("", 0.0, failed=str(error) or type(error).__name__, kind="input")
         return thing
 
     def _plan(self, thing: _Object) -> None:
@@ -229,7 +234,7 @@ class _Batch:
                 and queued not in self._ready
                 and all(name in thing.markers for name in stage.after)
             ):
-                heapq.heappush(self._ready, queued)
+                self._ready.append(queued)
 
     def _take(self, thing: _Object, stage: str, result: Marker | Death) -> None:
         """A stage has ended."""
@@ -246,9 +251,9 @@ class _Batch:
             self._read(thing, self._out.files(thing.entry.name))
         if thing.failed is None and not self._is_done(thing):
             self._make_ready(thing)
-        elif not thing.running:
-            self._ready = [item for item in self._ready if item[0] != thing.index]
-            heapq.heapify(self._ready)
+            return
+        self._ready = [item for item in self._ready if item[0] != thing.index]  # of one that has failed
+        if not thing.running:
             del self._active[thing.index]
             self._session.release(thing.entry.name)
             self._tell(thing)

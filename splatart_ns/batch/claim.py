@@ -11,6 +11,7 @@ import uuid
 from urllib.parse import quote
 
 from splatart_ns.batch.storage import Storage
+from splatart_ns.errors import InputError
 from splatart_ns.machine import process_lives
 
 _CLAIMS, _SESSIONS = ".batch/claims", ".batch/sessions"
@@ -30,7 +31,11 @@ class Session:
     def __init__(self, storage: Storage):
         self._storage = storage
         self.name = uuid.uuid4().hex
-        self._beat()
+        try:
+            self._beat()
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise InputError(f"{storage.url}: cannot be written ({reason}); give another --output-dir.") from None
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._keep_beating, daemon=True)
         self._thread.start()

@@ -21,6 +21,8 @@ class StubRecipe:
     """File that gets a line whenever a stage has left its result."""
     seconds: float = 0.0
     """What each stage takes."""
+    gpu: bool = False
+    """Whether copies are made on a GPU."""
 
     def fingerprint(self, entry):
         return fingerprint(entry.capture)
@@ -29,8 +31,9 @@ class StubRecipe:
         look = Stage("look", stage_key("look", fingerprint))
         if told is None:
             return [look]
+        seed = entry.settings.get("seed", 0)
         copies = [
-            Stage(f"copy {name}", stage_key("copy", name, text, entry.settings.get("seed", 0)), ("look",))
+            Stage(f"copy {name}", stage_key("copy", name, text, seed), ("look",), Needs(gpu=self.gpu))
             for name, text in told["texts"].items()
         ]
         key = stage_key("join", [copy.key for copy in copies], entry.settings.get("root"))
@@ -49,7 +52,10 @@ class StubRecipe:
         elif kind == "copy":
             (work.folder / "copies").mkdir()
             (work.folder / "copies" / name).write_text(work.outcome("look")["texts"][name].upper())
-            result = {"threads": os.environ["OMP_NUM_THREADS"]}, [f"copies/{name}"]
+            result = (
+                {"threads": os.environ["OMP_NUM_THREADS"], "gpu": os.environ["CUDA_VISIBLE_DEVICES"]},
+                [f"copies/{name}"],
+            )
         else:
             work.fetch("copies")
             texts = [file.read_text() for file in sorted((work.folder / "copies").iterdir())]

@@ -17,6 +17,7 @@ from stub_recipe import StubRecipe
 from splatart_ns.batch.batch import run_batch
 from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.pool import ProcessPool
+from splatart_ns.errors import InputError
 
 STAGES = ["look", "copy one", "copy two", "join"]
 
@@ -122,7 +123,21 @@ def test_a_capture_that_is_not_there_is_told(run, captures, tmp_path):
 
 def test_stages_run_with_one_thread_each(run, captures, tmp_path):
     run(captures("a"))
-    assert json.loads((tmp_path / "out/a/stages/copy one.json").read_text())["outcome"] == {"threads": "1"}
+    outcome = json.loads((tmp_path / "out/a/stages/copy one.json").read_text())["outcome"]
+    assert outcome == {"threads": "1", "gpu": ""}
+
+
+def test_stages_for_a_gpu_run_where_there_is_one(run, captures, tmp_path):
+    told = run(captures("a", "b"), recipe=StubRecipe(gpu=True), engine=ProcessPool(2, 4000, 1))
+    assert told.status() == {"a": "done", "b": "done"}
+    for marker in (tmp_path / "out").glob("*/stages/copy*.json"):
+        assert json.loads(marker.read_text())["outcome"]["gpu"] == "0"
+
+
+def test_an_output_folder_that_cannot_be_written_is_a_mistake(run, captures, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="file/out: cannot be written"):
+        run(captures("a"), tmp_path / "file/out")
 
 
 DRIVER = """
