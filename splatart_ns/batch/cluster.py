@@ -73,7 +73,7 @@ class RayCluster:
                 result = self._ray.get(reference)
             except self._ray.exceptions.RayError as error:
                 lines = str(error).strip().splitlines() or [type(error).__name__]
-                result = Death(f"Ray gave it up: {lines[0]}"[:500])
+                result = Death(f"Ray gave it up: {lines[-1].strip()}"[:500])
             results.append((self._tickets.pop(reference), result))
         return results
 

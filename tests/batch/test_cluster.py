@@ -1,6 +1,11 @@
 """The same on a Ray cluster, of which a node may go."""
 
+import contextlib
+import os
 import socket
+import sys
+import time
+from pathlib import Path
 
 import pytest
 from stub_recipe import StubRecipe
@@ -12,15 +17,27 @@ ray = pytest.importorskip("ray", reason="Ray is not installed: extra 'ray'")
 
 
 @pytest.fixture
-def two_nodes():
+def two_nodes(monkeypatch):
     """A local cluster of a head and another node, a core each."""
     from ray.cluster_utils import Cluster
 
+    here = [str(Path(__file__).parent), *filter(None, sys.path)]  # where tasks find their recipe
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(here))
+    known = ray._private.services.get_node
+
+    def patient(*arguments):  # Ray gives a node 30 seconds to start, too few on a busy machine
+        for _ in range(120):
+            with contextlib.suppress(RuntimeError):
+                return known(*arguments)
+            time.sleep(1)
+        return known(*arguments)
+
+    monkeypatch.setattr(ray._private.services, "get_node", patient)
     try:
         light = {"num_cpus": 1, "include_log_monitor": False, "no_monitor": True}
         cluster = Cluster(initialize_head=True, head_node_args={"include_dashboard": False, **light, **free_ports()})
         other = cluster.add_node(**light, **free_ports())
-    except Exception as error:  # Ray raises many types, as when a busy machine takes more than 30 seconds for it
+    except Exception as error:  # Ray raises many types
         pytest.skip(f"Ray cannot start here: {error}")
     yield cluster, other
     ray.shutdown()
