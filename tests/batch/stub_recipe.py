@@ -53,7 +53,7 @@ class StubRecipe:
             (work.folder / "copies").mkdir()
             (work.folder / "copies" / name).write_text(work.outcome("look")["texts"][name].upper())
             result = (
-                {"threads": os.environ["OMP_NUM_THREADS"], "gpu": os.environ["CUDA_VISIBLE_DEVICES"]},
+                {"threads": os.environ["OMP_NUM_THREADS"], "gpu": os.environ.get("CUDA_VISIBLE_DEVICES", "")},
                 [f"copies/{name}"],
             )
         else:
