@@ -80,10 +80,46 @@ def batch(
         address: Run on the Ray cluster there (auto, ray://HOST:PORT) instead of this machine's cores.
         retry_failed: Try again what has failed before.
     """
-    from splatart_ns.batch.command import run
+    from splatart_ns.batch.command import fit_captures
 
     settings = {"quality": quality, "root": None, "seed": seed, "joints": []}
-    raise SystemExit(run(root, output_dir, settings, rasterizer, export, address, retry_failed, CONSOLE))
+    raise SystemExit(fit_captures(root, output_dir, settings, rasterizer, export, address, retry_failed, CONSOLE))
+
+
+def shards(
+    root: Annotated[str, tyro.conf.Positional],
+    output_dir: str,
+    images: int,
+    shard_size: int = 1000,
+    states: int = 64,
+    resolution: int = 256,
+    views: Literal["sphere", "hemisphere"] = "sphere",
+    seed: int = 0,
+    rasterizer: Rasterizer = "auto",
+    address: str | None = None,
+) -> None:
+    """Render labelled images of many bundles at random views and configurations, as WebDataset tar shards.
+
+    The samples are those of `splatart render --dataset`. Run it again to make what is missing or changed: a shard
+    depends on its own bundles alone. Exit codes are those of `splatart batch`.
+
+    Args:
+        root: A folder or fsspec URL above bundles, as the output folder of `splatart batch`.
+        output_dir: A folder or an fsspec URL, for shard-NNNNNN/images.tar.
+        images: How many, of all bundles together; they take turns.
+        shard_size: Images of a shard.
+        states: Configurations of each bundle.
+        resolution: Pixels along each side.
+        views: See the objects from everywhere, or from above only.
+        seed: Seed of views and configurations.
+        rasterizer: As in `splatart fit`.
+        address: As in `splatart batch`.
+    """
+    from splatart_ns.batch.command import write_shards
+    from splatart_ns.batch.shards import ShardOptions
+
+    options = ShardOptions(images, shard_size, states, resolution, views, seed)
+    raise SystemExit(write_shards(root, output_dir, options, rasterizer, address, CONSOLE))
 
 
 def render(
@@ -466,7 +502,7 @@ def main() -> None:
     warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True")
     commands = {"fit": fit, "render": render, "view": view, "eval": evaluate, "check": check, "import": import_capture}
     commands |= {"labels": labels, "segment": segment}
-    commands |= {"batch": batch, "export": export, "synth": synth, "demo": demo}
+    commands |= {"batch": batch, "shards": shards, "export": export, "synth": synth, "demo": demo}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="splatart", description=__doc__)
         sys.stdout.flush()

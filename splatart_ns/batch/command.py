@@ -1,17 +1,20 @@
-"""`splatart batch`."""
+"""`splatart batch` and `splatart shards`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
 
 from splatart_ns.batch.batch import run_batch
 from splatart_ns.batch.cluster import RayCluster
-from splatart_ns.batch.entry import read_entries
+from splatart_ns.batch.entry import Entry, read_entries
 from splatart_ns.batch.fitting import Fitting
 from splatart_ns.batch.pool import ProcessPool
 from splatart_ns.batch.progress import LiveProgress
+from splatart_ns.batch.shards import Sharding, ShardOptions, Shards, find_bundles
+from splatart_ns.batch.stage import Recipe
 from splatart_ns.batch.storage import open_storage
 from splatart_ns.errors import InputError
 
@@ -19,7 +22,7 @@ ALL_DONE, SOME_FAILED, ALL_FAILED = 0, 3, 4
 """Exit codes."""
 
 
-def run(
+def fit_captures(
     source: str,
     out_url: str,
     settings: dict[str, Any],
@@ -32,15 +35,34 @@ def run(
     """Fit all captures of a source, see `read_entries`; returns the exit code."""
     if not 0 <= settings["seed"] < 2**32:
         raise InputError(f"--seed is {settings['seed']}; give 0 to {2**32 - 1}.")
-    entries = read_entries(source, settings)
-    out = open_storage(out_url)
     recipe = Fitting(rasterizer, tuple(dict.fromkeys(exports)))
+    return _run(read_entries(source, settings), out_url, recipe, address, retry_failed, console, "objects")
+
+
+def write_shards(
+    source: str, out_url: str, options: ShardOptions, rasterizer: str, address: str | None, console: Console
+) -> int:
+    """Render labelled images of all bundles below a source; returns the exit code."""
+    entries = Shards(source, find_bundles(source), options)
+    return _run(entries, out_url, Sharding(options, rasterizer), address, True, console, "shards")
+
+
+def _run(
+    entries: Sequence[Entry],
+    out_url: str,
+    recipe: Recipe,
+    address: str | None,
+    retry_failed: bool,
+    console: Console,
+    things: str,
+) -> int:
+    out = open_storage(out_url)
     engine = ProcessPool() if address is None else RayCluster(address)
     with LiveProgress(entries, out, console) as progress:
         run_batch(entries, out.url, recipe, engine, progress, retry_failed)
     counts = progress.report.counts
     failed = f", {counts['failed']} failed" if counts["failed"] else ""
-    console.print(f"{counts['done']} of {len(entries)} objects done{failed}: {out.url}/report.html", soft_wrap=True)
+    console.print(f"{counts['done']} of {len(entries)} {things} done{failed}: {out.url}/report.html", soft_wrap=True)
     if counts["failed"] == 0:
         return ALL_DONE
     return SOME_FAILED if counts["done"] else ALL_FAILED

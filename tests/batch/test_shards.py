@@ -1,0 +1,94 @@
+"""WebDataset shards of many bundles."""
+
+import io
+import json
+import shutil
+import tarfile
+
+import numpy as np
+import pytest
+from bundle_of_two import save_box
+from PIL import Image
+
+from splatart_ns.batch.batch import run_batch
+from splatart_ns.batch.pool import ProcessPool
+from splatart_ns.batch.shards import Sharding, ShardOptions, Shards, find_bundles
+from splatart_ns.errors import InputError
+
+OPTIONS = ShardOptions(images=10, shard_size=4, states=3, resolution=24)
+
+
+@pytest.fixture(scope="module")
+def bundles(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bundles")
+    for number, name in enumerate(("a", "deep/b", "c")):
+        save_box(folder / name, seed=number)
+    (folder / ".batch").mkdir()
+    return folder
+
+
+@pytest.fixture
+def make(recorder):
+    def make(bundles, out, options=OPTIONS):
+        told = recorder()
+        entries = Shards(str(bundles), find_bundles(str(bundles)), options)
+        run_batch(entries, str(out), Sharding(options, "torch"), ProcessPool(1, 8000, 0), told)
+        return told
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def out(bundles, tmp_path_factory):
+    return tmp_path_factory.mktemp("shards")
+
+
+def members(path):
+    with tarfile.open(path) as tar:
+        return {member.name: tar.extractfile(member).read() for member in tar}
+
+
+def test_bundles_are_found_in_order(bundles, tmp_path):
+    assert find_bundles(str(bundles)) == ["a", "c", "deep/b"]
+    with pytest.raises(InputError, match="no bundle"):
+        find_bundles(str(tmp_path))
+
+
+def test_every_image_is_in_one_shard_and_bundles_take_turns(bundles):
+    entries = list(Shards(str(bundles), ["a", "c", "deep/b"], OPTIONS))
+    assert [entry.name for entry in entries] == ["shard-000000", "shard-000001", "shard-000002"]
+    assert [(entry.settings["first"], entry.settings["count"]) for entry in entries] == [(0, 4), (4, 4), (8, 2)]
+    assert [entry.settings["bundles"] for entry in entries] == [
+        ["a", "c", "deep/b"],
+        ["c", "deep/b", "a"],
+        ["deep/b", "a"],
+    ]
+
+
+def test_shards_hold_labelled_images_and_one_can_be_made_again_alone(bundles, make, out):
+    told = make(bundles, out)
+    assert set(told.status().values()) == {"done"}
+    first = members(out / "shard-000000/images.tar")
+    assert list(first)[:4] == [f"000000000.{suffix}" for suffix in ("rgb.png", "parts.png", "depth.png", "json")]
+    about = [json.loads(first[f"{image:09d}.json"]) for image in range(4)]
+    assert [one["object"] for one in about] == ["a", "c", "deep/b", "a"]
+    assert [one["state"] for one in about] == [0, 0, 0, 1] and about[0]["q"] != about[1]["q"]
+    pixels = {name: np.asarray(Image.open(io.BytesIO(data))) for name, data in first.items() if name.endswith("png")}
+    assert pixels["000000000.rgb.png"].shape == (24, 24, 4)
+    assert set(np.unique(pixels["000000000.parts.png"])) <= {0, *map(int, about[0]["parts"])}
+    seen = pixels["000000000.parts.png"] > 0
+    assert seen.any() and (pixels["000000000.depth.png"][seen] > 0).mean() > 0.9
+
+    before = (out / "shard-000001/images.tar").read_bytes()
+    other = (out / "shard-000000/images.tar").stat().st_mtime_ns
+    shutil.rmtree(out / "shard-000001")
+    again = make(bundles, out)
+    assert {name for name, _ in again.stages} == {"shard-000001"}
+    assert (out / "shard-000001/images.tar").read_bytes() == before
+    assert (out / "shard-000000/images.tar").stat().st_mtime_ns == other
+
+
+@pytest.mark.parametrize("options", [{"images": 0}, {"shard_size": 0}, {"states": 0}])
+def test_options_without_sense_are_mistakes(bundles, options):
+    with pytest.raises(InputError, match=f"--{next(iter(options)).replace('_', '-')}"):
+        Shards(str(bundles), ["a"], ShardOptions(**({"images": 10} | options)))
