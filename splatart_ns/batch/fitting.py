@@ -18,8 +18,6 @@ from splatart_ns.files import write_json
 
 # What a stage needs is imported when it runs: the process that only hands out stages starts at once and stays small.
 if TYPE_CHECKING:
-    from nerfstudio.engine.trainer import TrainerConfig
-
     from splatart_ns.plugin.fit import Settings
 
 _BASE_MB = 1100
@@ -144,11 +142,12 @@ def _train(work: Work, stage: str, settings: Settings) -> tuple[dict[str, Any], 
     return outcome, kept
 
 
-def _run_folder(config: TrainerConfig, bundle: Path) -> str:
+def _run_folder(config: Any, bundle: Path) -> str:
+    """Where a stage's run lies in the bundle; `config` is nerfstudio's TrainerConfig."""
     return config.get_base_dir().relative_to(bundle).as_posix()
 
 
-def _write_config(config: TrainerConfig, path: Path) -> None:
+def _write_config(config: Any, path: Path) -> None:
     """As `TrainerConfig.save_config` does, which writes to where the run lies."""
     import yaml
 
