@@ -14,6 +14,11 @@ from splatart_ns.batch.storage import Storage, open_storage
 from splatart_ns.errors import InputError
 
 _TRANSFORMS = "transforms.json"
+_MARKS = (
+    {"transforms_train_start.json", "transforms_train_end.json"},  # ArtGS
+    {"init_keyframes.yml", "cam_K.txt"},  # DTA
+)
+"""Files of captures in other layouts, see `capture.peer_layouts`."""
 _SETTINGS = ("quality", "root", "seed", "joints")
 _QUALITIES = ("draft", "standard", "high")
 _LONGEST_NAME = 150
@@ -59,10 +64,12 @@ def _find(storage: Storage, settings: dict[str, Any]) -> list[Entry]:
 
 def _captures(storage: Storage, path: str) -> list[str] | None:
     """The folders at or below a path that look like a capture of one of the layouts; None for a state's folder."""
-    folders, files = storage.children(path)
+    folders, files = (set(names) for names in storage.children(path))
     if _TRANSFORMS in files:
         return [path] if _holds_states(storage.read(_join(path, _TRANSFORMS))) else None
-    if {"start", "end"} <= set(folders) and "camera_train.json" in storage.children(_join(path, "start"))[1]:
+    if {"start", "end"} <= folders and "camera_train.json" in storage.children(_join(path, "start"))[1]:
+        return [path]
+    if any(files.issuperset(mark) for mark in _MARKS):
         return [path]
     inner = {
         below: _captures(storage, below)

@@ -184,6 +184,7 @@ def _summarize(work: Work) -> dict[str, Any]:
 
     work.fetch("articulation.json", "parts")
     bundle = load_bundle(work.folder)
+    stages = [*(f"semantic {state}" for state in bundle.states), "pose", "joint"]
     joints = [
         {
             "name": joint.name,
@@ -205,7 +206,7 @@ def _summarize(work: Work) -> dict[str, Any]:
         "joints": joints,
         "movable": sum(JOINT_DOFS[joint["type"]] > 0 for joint in joints),
         "unattached": len(bundle.parts) - 1 - len(joints),
-        "notes": work.outcome("pose")["notes"] + work.outcome("joint")["notes"],
+        "notes": sum((work.outcome(stage)["notes"] for stage in stages), []),
         "thumbnails": _thumbnails(bundle),
     }
 

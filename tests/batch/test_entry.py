@@ -31,11 +31,15 @@ def test_captures_of_all_layouts_are_found(make, tmp_path):
     make("one_file/eval/novel_00/transforms.json", "{}")
     for state in ("start", "end"):
         make(f"paris/{state}/camera_train.json")
+    for state in ("start", "end"):
+        make(f"artgs/transforms_train_{state}.json")
+    make("dta/init_keyframes.yml")
+    make("dta/cam_K.txt")
     make("notes/readme.json")
     make(".hidden/transforms.json", '{"frames": [{"state": 0}]}')
     entries = read_entries(str(tmp_path), SETTINGS)
-    assert [entry.name for entry in entries] == ["kitchen/drawer", "one_file", "paris"]
-    assert entries[0].capture == str(tmp_path / "kitchen/drawer") and entries[0].settings == SETTINGS
+    assert [entry.name for entry in entries] == ["artgs", "dta", "kitchen/drawer", "one_file", "paris"]
+    assert entries[2].capture == str(tmp_path / "kitchen/drawer") and entries[0].settings == SETTINGS
 
 
 def test_a_broken_file_among_captures_is_one_of_them(make, tmp_path):
