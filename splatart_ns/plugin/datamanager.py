@@ -69,7 +69,7 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         """Put points where VanillaPipeline looks for them."""
         state = self.capture.states[self.dataparser.config.state]
         if state.points is not None:
-            xyz, rgb = load_points(state.points, self.capture.normalization)
+            xyz, rgb = load_points(state.points, self.capture.normalization, state.placement)
         else:
             views = [self.train_dataset.get_view(i) for i in range(len(self.train_dataset))]
             if any(view.alpha is None for view in views):

@@ -22,7 +22,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from splatart_ns.bundle import load_bundle
-from splatart_ns.capture.capture import Capture
+from splatart_ns.capture.capture import Capture, Worlds
 from splatart_ns.capture.check import require_valid
 from splatart_ns.errors import InputError
 from splatart_ns.files import write_json
@@ -64,6 +64,7 @@ class Settings:
     seed: int
     rasterizer: Backend = "auto"
     joints: list[str] = field(default_factory=list)
+    worlds: Worlds = "shared"
 
 
 class Report:
@@ -104,7 +105,7 @@ class Report:
             ]
             had, wanted = earlier["settings"], self.data["settings"]
             same = all(earlier.get(key) == self.data[key] for key in ("capture", "capture_sha256"))
-            last = ("root", "joints")  # the last stage alone asks for them
+            last = ("root", "joints") if wanted["worlds"] == "shared" else ("joints",)  # the last stage alone asks
             same = same and {k: v for k, v in had.items() if k not in last} == {
                 k: v for k, v in wanted.items() if k not in last
             }
@@ -160,6 +161,7 @@ def fit(
     seed: int = 0,
     rasterizer: Backend = "auto",
     joints: tuple[str, ...] = (),
+    worlds: Worlds | None = None,
 ) -> Path:
     """Run what is missing of all stages and leave the bundle in `output_dir`.
 
@@ -176,7 +178,7 @@ def fit(
     if not 0 <= seed < 2**32:
         raise InputError(f"--seed is {seed}; give 0 to {2**32 - 1}.")
     output_dir = output_dir.absolute()
-    settings = Settings(quality, root, seed, rasterizer, list(joints))
+    settings = Settings(quality, root, seed, rasterizer, list(joints), worlds or capture.worlds)
     report = Report(output_dir / "report.json", capture, settings)
     try:
         (output_dir / "runs").mkdir(parents=True, exist_ok=True)
@@ -208,7 +210,7 @@ def _semantic_config(capture: Capture, state: int, runs: Path, settings: Setting
     _set_decay(config, effort.steps)
     config.pipeline.datamanager.seed_gaussians = effort.gaussians
     config.pipeline.datamanager.seed = settings.seed
-    return _placed(config, capture, state, runs, capture.states[state].name, settings.seed)
+    return _placed(config, capture, state, runs, capture.states[state].name, settings)
 
 
 def _pose_config(capture: Capture, semantic_runs: list[Path], runs: Path, settings: Settings) -> TrainerConfig:
@@ -217,7 +219,9 @@ def _pose_config(capture: Capture, semantic_runs: list[Path], runs: Path, settin
     config.pipeline.seed = settings.seed
     config.max_num_iterations = config.pipeline.model.pose_steps + EFFORTS[settings.quality].merge_steps
     _set_decay(config, config.max_num_iterations)
-    return _placed(config, capture, 0, runs, "all", settings.seed)
+    if settings.worlds != "shared":
+        config.pipeline.root = settings.root
+    return _placed(config, capture, 0, runs, "all", settings)
 
 
 def _joint_config(capture: Capture, pose_run: Path, runs: Path, settings: Settings) -> TrainerConfig:
@@ -228,18 +232,19 @@ def _joint_config(capture: Capture, pose_run: Path, runs: Path, settings: Settin
     config.pipeline.joints = tuple(settings.joints)
     config.pipeline.seed = settings.seed
     config.pipeline.settings = asdict(settings)
-    return _placed(config, capture, 0, runs, "all", settings.seed)
+    return _placed(config, capture, 0, runs, "all", settings)
 
 
 def _placed(
-    config: TrainerConfig, capture: Capture, state: int, runs: Path, experiment: str, seed: int
+    config: TrainerConfig, capture: Capture, state: int, runs: Path, experiment: str, settings: Settings
 ) -> TrainerConfig:
     """With its capture, its run folder, and none of what `ns-train` shows and saves meanwhile."""
     config.data = capture.path.absolute()
     config.pipeline.datamanager.data = config.data
     config.pipeline.datamanager.dataparser.data = config.data
     config.pipeline.datamanager.dataparser.state = state
-    config.machine.seed = seed
+    config.pipeline.datamanager.dataparser.worlds = settings.worlds
+    config.machine.seed = settings.seed
     config.output_dir = runs
     config.experiment_name = experiment
     config.timestamp = "fit"

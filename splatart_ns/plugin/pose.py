@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
@@ -16,9 +18,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from splatart_ns.bundle.motion_file import read_motions
-from splatart_ns.capture.capture import UNLABELLED
+from splatart_ns.capture.capture import UNLABELLED, Capture
 from splatart_ns.capture.view import View, load_views
 from splatart_ns.errors import InputError
+from splatart_ns.geometry.se3 import so3_log
+from splatart_ns.geometry.similarity import scale_of
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_config
 from splatart_ns.plugin.gaussians import gauss_params_from_splat, splat_from_state
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
@@ -27,8 +31,9 @@ from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
-from splatart_ns.stages.render_choice import initial_motion
+from splatart_ns.stages.render_choice import SUSPECT, initial_motion
 from splatart_ns.stages.visibility import visibility
+from splatart_ns.stages.world import WorldFit, anchors, fit_worlds, moved_splat, moved_views
 
 
 @dataclass
@@ -57,6 +62,7 @@ class PoseModel(SplatartModel):
         self.register_buffer("merged", torch.tensor(False))
         self.register_buffer("covariance", torch.zeros(1, self.num_parts, 6, 6, dtype=torch.float64))
         self.register_buffer("held_ratio", torch.full((self.num_parts, self.num_parts), torch.nan))
+        self.register_buffer("worlds", torch.eye(4, dtype=torch.float64)[None])
         eye = torch.eye(4, dtype=torch.float64).repeat(1, self.num_parts, 1, 1)
         self.poses = PartPoses(eye, torch.zeros(self.num_parts, 3), torch.ones(self.num_parts))
 
@@ -91,7 +97,7 @@ class PoseModel(SplatartModel):
         return self.splat_at(self.state, self.poses.T())
 
     def load_state_dict(self, state, **kwargs):
-        for name in ("state_ids", "covariance", "held_ratio"):
+        for name in ("state_ids", "covariance", "held_ratio", "worlds"):
             setattr(self, name, torch.zeros_like(state[name], device=self.device))
         base = state["poses.base"].to(self.device)
         eye = torch.eye(4, dtype=torch.float64, device=self.device).expand_as(base).clone()
@@ -113,6 +119,8 @@ class PosePipelineConfig(VanillaPipelineConfig):
     """A bundle's articulation.json, or another JSON file with the parts' motions in the same form."""
     snap: bool = True
     """Whether parts whose images fit no motion are held still."""
+    root: str | None = None
+    """Where the states have worlds of their own: name of the part that brings them together; chosen when not given."""
     seed: int = 0
     """Seed of the registration and of the order of views."""
 
@@ -125,6 +133,7 @@ class PosePipeline(VanillaPipeline):
     def __init__(self, config: PosePipelineConfig, device: str, test_mode: str = "val", *args, **kwargs):
         super().__init__(config, device, test_mode, *args, **kwargs)
         self.notes: list[str] = []
+        self.findings: dict[str, Any] = {}
         if test_mode != "val":  # a checkpoint brings everything
             return
         capture = self.datamanager.capture
@@ -134,6 +143,9 @@ class PosePipeline(VanillaPipeline):
         ]
         runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
         splats = [self._load_splat(run).to(device) for run in runs]
+        self.model.worlds = torch.from_numpy(np.stack([state.placement for state in capture.states])).to(device)
+        if capture.worlds != "shared":
+            self._bring_together(splats, capture)
         S, P = len(splats), self.model.num_parts
         self._reference, self._known, self._frozen = [0] * P, torch.ones(S, P, dtype=torch.bool), torch.zeros(S, P) > 0
         self.model.start(splats, self._initial_poses(splats), self._frozen)
@@ -151,6 +163,30 @@ class PosePipeline(VanillaPipeline):
         if not bool((splat.part_ids > 0).any()):
             raise InputError(f"{run} learned no parts; train splatart-semantic longer, with labelled frames.")
         return splat.select(splat.part_ids > 0)
+
+    def _bring_together(self, splats: list[Splat], capture: Capture) -> None:
+        """Move splats and views of all states into the world of state 0."""
+        P = self.model.num_parts
+        seen = [visibility(s, v) for s, v in zip(splats, self.views, strict=True)]
+        root = next((p for p, name in capture.parts.items() if name == self.config.root), None)
+        parts = anchors(splats, seen, P) if root is None else [root]
+        found = fit_worlds(splats, self.views, seen, parts, capture.worlds == "similar", self.config.seed)
+        if found is None:
+            raise InputError(
+                f"{capture.path}: no part is seen well enough in all states to bring their worlds together; label "
+                "a part in more frames of every state, or name one by --root."
+            )
+        part, fits = found
+        self.findings["worlds"] = []
+        for k, fit in enumerate(fits, start=1):
+            splats[k] = moved_splat(splats[k], fit.T)
+            self.views[k] = moved_views(self.views[k], fit.T)
+            to_first = torch.from_numpy(capture.normalization.motion_to_world(fit.T.numpy(force=True)))
+            self.model.worlds[k] = to_first.to(self.model.worlds) @ self.model.worlds[k]
+            told = world_record(capture.states[k].name, self.model.part_names[part], self.model.worlds[k], fit)
+            self.findings["worlds"].append(told)
+            self.notes.append(world_sentence(told, capture.states[0].name))
+            CONSOLE.log(self.notes[-1])
 
     def _initial_poses(self, splats: list[Splat]) -> Tensor:
         """Poses [S, P, 4, 4] to begin from; keeps in mind the reference states, and what is known and what stays."""
@@ -289,6 +325,35 @@ class PosePipeline(VanillaPipeline):
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         return {**super().get_param_groups(), "part_poses": list(self.model.poses.parameters())}
+
+
+def world_record(state: str, part: str, T: Tensor, fit: WorldFit) -> dict[str, Any]:
+    """What report.json says of a state's world, T [4, 4] its similarity to that of state 0, in the capture's unit."""
+    turn, scale = fit.covariance.diagonal()[3:6].sum().sqrt(), fit.covariance[6, 6].sqrt()
+    return {
+        "state": state,
+        "part": part,
+        "T_world_state": T.tolist(),
+        "scale": float(scale_of(T)),
+        "scale_deviation": float(scale_of(T) * scale),
+        "turn_deviation_degrees": math.degrees(float(turn)),
+        "residual_ratio": fit.ratio,
+        "covariance": fit.covariance.tolist(),
+    }
+
+
+def world_sentence(record: dict[str, Any], first: str) -> str:
+    """The same for a person."""
+    R = torch.tensor(record["T_world_state"], dtype=torch.float64)[:3, :3] / record["scale"]
+    turn = math.degrees(float(so3_log(R).norm()))
+    sentence = (
+        f"{record['state']}: its world is brought to that of {first} by the part {record['part']}: scale "
+        f"{record['scale']:.5f} +- {record['scale_deviation']:.5f}, turned by {turn:.2f} "
+        f"+- {record['turn_deviation_degrees']:.2f} deg"
+    )
+    if record["residual_ratio"] > SUSPECT:
+        return f"{sentence}; its images fit badly, check the result, or name another part by --root."
+    return f"{sentence}."
 
 
 def with_silhouette(view: View) -> View | None:
