@@ -11,7 +11,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 
 from splatart_ns.capture.capture import UNLABELLED, Capture
 from splatart_ns.capture.view import View, load_points, load_view
-from splatart_ns.stages.hull import seed_points
+from splatart_ns.stages.hull import seed_points, slack
 
 
 class CaptureDataset(InputDataset):
@@ -58,6 +58,8 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
 
     def __init__(self, config: SplatartDatamanagerConfig, *args, test_mode: str = "val", **kwargs):
         super().__init__(config, *args, test_mode=test_mode, **kwargs)
+        self.slack = 0
+        """By how many pixels the silhouettes contradict each other (see `stages.hull.slack`)."""
         if config.seed_gaussians > 0 and test_mode == "val":  # otherwise a checkpoint brings the Gaussians
             self._add_seed_points()
 
@@ -68,14 +70,17 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
     def _add_seed_points(self) -> None:
         """Put points where VanillaPipeline looks for them."""
         state = self.capture.states[self.dataparser.config.state]
+        views = [self.train_dataset.get_view(i) for i in range(len(self.train_dataset))]
+        silhouettes = all(view.alpha is not None for view in views)
+        if silhouettes:
+            self.slack = slack(views)
         if state.points is not None:
             xyz, rgb = load_points(state.points, self.capture.normalization, state.placement)
+        elif not silhouettes:
+            return  # nothing says where the object is: the model starts from random points
         else:
-            views = [self.train_dataset.get_view(i) for i in range(len(self.train_dataset))]
-            if any(view.alpha is None for view in views):
-                return  # nothing says where the object is: the model starts from random points
             generator = torch.Generator().manual_seed(self.config.seed)
-            seeds = seed_points(views, len(self.capture.parts), self.config.seed_gaussians, generator)
+            seeds = seed_points(views, len(self.capture.parts), self.config.seed_gaussians, generator, slack=self.slack)
             if seeds is None:
                 return
             xyz, rgb = seeds.xyz, seeds.rgb

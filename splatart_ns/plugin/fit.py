@@ -29,6 +29,7 @@ from splatart_ns.files import write_json
 from splatart_ns.method_configs.joint import method as joint_method
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.method_configs.semantic import method as semantic_method
+from splatart_ns.plugin.semantic import RefineCameras
 from splatart_ns.plugin.stage_run import Outcome, num_processes, run_side_by_side, run_stage
 from splatart_ns.rasterize.rasterization import Backend, default_backend, set_backend
 from splatart_ns.stages.joint_constraint import parse_constraints
@@ -65,6 +66,7 @@ class Settings:
     rasterizer: Backend = "auto"
     joints: list[str] = field(default_factory=list)
     worlds: Worlds = "shared"
+    refine_cameras: RefineCameras = "auto"
 
 
 class Report:
@@ -162,6 +164,7 @@ def fit(
     rasterizer: Backend = "auto",
     joints: tuple[str, ...] = (),
     worlds: Worlds | None = None,
+    refine_cameras: RefineCameras = "auto",
 ) -> Path:
     """Run what is missing of all stages and leave the bundle in `output_dir`.
 
@@ -178,7 +181,7 @@ def fit(
     if not 0 <= seed < 2**32:
         raise InputError(f"--seed is {seed}; give 0 to {2**32 - 1}.")
     output_dir = output_dir.absolute()
-    settings = Settings(quality, root, seed, rasterizer, list(joints), worlds or capture.worlds)
+    settings = Settings(quality, root, seed, rasterizer, list(joints), worlds or capture.worlds, refine_cameras)
     report = Report(output_dir / "report.json", capture, settings)
     try:
         (output_dir / "runs").mkdir(parents=True, exist_ok=True)
@@ -205,6 +208,7 @@ def _semantic_config(capture: Capture, state: int, runs: Path, settings: Setting
     part_steps = config.max_num_iterations - config.pipeline.model.semantic_start
     config.max_num_iterations = effort.steps + part_steps
     config.pipeline.model.semantic_start = effort.steps
+    config.pipeline.model.refine_cameras = settings.refine_cameras
     config.pipeline.model.stop_split_at = 7 * effort.steps // 10
     config.pipeline.model.max_gaussians = 3 * effort.gaussians // 2
     _set_decay(config, effort.steps)

@@ -137,12 +137,14 @@ class PosePipeline(VanillaPipeline):
         if test_mode != "val":  # a checkpoint brings everything
             return
         capture = self.datamanager.capture
-        self.views: list[list[View]] = [
-            [v.to(device) for view in load_views(capture, s, "train") if (v := with_silhouette(view)) is not None]
-            for s in range(len(capture.states))
-        ]
         runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
-        splats = [self._load_splat(run).to(device) for run in runs]
+        checkpoints = [read_checkpoint(run) for run in runs]
+        self.views: list[list[View]] = [
+            [v.to(device) for view in refined_views(capture, s, checkpoint) if (v := with_silhouette(view)) is not None]
+            for s, checkpoint in enumerate(checkpoints)
+        ]
+        self._cameras_refined = any(bool(checkpoint["_model.cameras_refined"]) for checkpoint in checkpoints)
+        splats = [self._load_splat(*pair).to(device) for pair in zip(runs, checkpoints, strict=True)]
         self.model.worlds = torch.from_numpy(np.stack([state.placement for state in capture.states])).to(device)
         if capture.worlds != "shared":
             self._bring_together(splats, capture)
@@ -152,9 +154,9 @@ class PosePipeline(VanillaPipeline):
         self._pairs = self._shuffled_pairs()
         self._own = self._shuffled_views()
 
-    def _load_splat(self, run: Path) -> Splat:
+    def _load_splat(self, run: Path, checkpoint: dict[str, Tensor]) -> Splat:
         """A state's labelled Gaussians without the background's."""
-        splat = splat_from_state(read_checkpoint(run))
+        splat = splat_from_state(checkpoint)
         if splat.part_logits.shape[1] != self.model.num_parts + 1:
             raise InputError(
                 f"{run} was trained with {splat.part_logits.shape[1] - 1} parts and the capture has "
@@ -199,6 +201,8 @@ class PosePipeline(VanillaPipeline):
             M[..., :3, 3] = centroids - centroids[0]
             return M
         seen = [visibility(s, v) for s, v in zip(splats, self.views, strict=True)]
+        # Where cameras were refined, each state has kept the mean error of its own: what rests seems to move by that.
+        snap = self.config.snap and not self._cameras_refined
         self._reference = reference_states(splats, seen, P)
         for p, first in enumerate(self._reference):
             for s in range(S):
@@ -208,7 +212,7 @@ class PosePipeline(VanillaPipeline):
                 motion = initial_motion(*pair, p + 1, self.config.seed)
                 M[s, p] = motion.T.cpu()
                 self._known[s, p] = motion.found
-                self._frozen[s, p] = not motion.found or (self.config.snap and motion.still)
+                self._frozen[s, p] = not motion.found or (snap and motion.still)
         return since_state_0(M, self._known)
 
     def _note_unknown(self, known: Tensor) -> None:
@@ -354,6 +358,17 @@ def world_sentence(record: dict[str, Any], first: str) -> str:
     if record["residual_ratio"] > SUSPECT:
         return f"{sentence}; its images fit badly, check the result, or name another part by --root."
     return f"{sentence}."
+
+
+def refined_views(capture: Capture, state: int, checkpoint: dict[str, Tensor]) -> list[View]:
+    """The training views of a state with the cameras that its splatart-semantic run ended with."""
+    views, viewmats = load_views(capture, state, "train"), checkpoint.get("_model.viewmats", ())
+    if len(viewmats) != len(views):
+        raise InputError(
+            f"{capture.path}: {capture.states[state].name} has {len(views)} training frames, but its splatart-semantic "
+            f"run has {len(viewmats)}; train it again."
+        )
+    return [replace(view, viewmat=viewmat.float()) for view, viewmat in zip(views, viewmats, strict=True)]
 
 
 def with_silhouette(view: View) -> View | None:

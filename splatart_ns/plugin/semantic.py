@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -14,10 +14,14 @@ from torch import Tensor
 
 from splatart_ns.capture.view import View
 from splatart_ns.errors import InputError
+from splatart_ns.geometry.se3 import inverse
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.rasterize.ssim import l1_ssim_loss
-from splatart_ns.stages.hull import carve
+from splatart_ns.stages.camera_refinement import PASSES, camera_change, refine_cameras
+from splatart_ns.stages.hull import carve, slack
 from splatart_ns.stages.semantic import accumulation_loss, part_image, segmentation_loss, vote_logits
+
+RefineCameras = Literal["auto", "on", "off"]
 
 
 @dataclass
@@ -34,6 +38,8 @@ class SemanticModelConfig(SplatartModelConfig):
     max_gaussians: int = 12000
     """Gaussians are not split or duplicated beyond this number."""
     background_color: Literal["random", "black", "white"] = "random"
+    refine_cameras: RefineCameras = "auto"
+    """Whether the cameras' poses are refined while geometry and colour learn; auto: if no hull fits the images."""
 
 
 class SemanticModel(SplatartModel):
@@ -64,6 +70,13 @@ class SemanticModel(SplatartModel):
             verbose=False,
         )
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
+        # World to camera, OpenCV axes, of the training frames as they were last refined.
+        self.register_buffer("viewmats", torch.eye(4, dtype=torch.float64).repeat(self.num_train_data, 1, 1))
+        self.register_buffer("cameras_refined", torch.tensor(False))
+
+    def load_state_dict(self, state, **kwargs):
+        self.viewmats = torch.zeros_like(state["viewmats"], device=self.device)
+        return super().load_state_dict(state, **kwargs)
 
     @property
     def learns_parts(self) -> bool:
@@ -110,9 +123,9 @@ class SemanticModel(SplatartModel):
             self.strategy.grow_grad2d = max(self.strategy.grow_grad2d, float(need.topk(room + 1).values[-1]))
 
     @torch.no_grad()
-    def fade_outside(self, views: list[View]) -> None:
+    def fade_outside(self, views: list[View], slack: int) -> None:
         """Make Gaussians with their centre outside a silhouette, or seen by no view, transparent: they get pruned."""
-        outside = ~carve(views, self.means.cpu(), dilate=2).to(self.device)
+        outside = ~carve(views, self.means.cpu(), dilate=2 + slack).to(self.device)
         self.gauss_params["opacities"][outside] = -10.0
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
@@ -154,7 +167,16 @@ class SemanticPipeline(VanillaPipeline):
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
-        self._views: list[View] | None = None
+        self.notes: list[str] = []
+        self.findings: dict[str, Any] = {}
+        self._slack = self.datamanager.slack
+        wanted = self.model.config.refine_cameras
+        self._refines = wanted == "on" or (wanted == "auto" and self._slack > 0)
+        dataset = self.datamanager.train_dataset
+        if self.datamanager.test_mode == "val":
+            self._views = [dataset.get_view(i) for i in range(len(dataset))]
+            self._given = torch.stack([view.viewmat for view in self._views]).double()
+            self.model.viewmats = self._given.to(self.device)
 
     def get_train_loss_dict(self, step: int):
         if self.model.learns_parts:
@@ -185,6 +207,8 @@ class SemanticPipeline(VanillaPipeline):
             )
         callbacks = super().get_training_callbacks(training_callback_attributes)
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+        if self._refines:
+            callbacks.append(TrainingCallback(before, self._refine_cameras))
         callbacks.append(TrainingCallback(before, self._keep_inside))
         if self.model.config.vote_init:
             callbacks.append(TrainingCallback(before, self._vote_at_semantic_start))
@@ -195,17 +219,37 @@ class SemanticPipeline(VanillaPipeline):
         config = self.model.config
         if step % config.refine_every != 0 or not 0 < step <= config.semantic_start:
             return
-        if self._views is None:
-            dataset = self.datamanager.train_dataset
-            self._views = [dataset.get_view(i) for i in range(len(dataset))]
         if all(view.alpha is not None for view in self._views):
-            self.model.fade_outside(self._views)
+            self.model.fade_outside(self._views, self._slack)
+
+    def _refine_cameras(self, step: int) -> None:
+        """Where it is time for it, move the cameras of the training frames."""
+        due = [p for p in PASSES if step == round(p.at * self.model.config.semantic_start)]
+        if not due:
+            return
+        model = self.model
+        model.viewmats = refine_cameras(model.splat.detach(), self._views, self._given, due[-1].pixels)
+        model.cameras_refined = torch.tensor(True, device=self.device)
+        pairs = zip(self._views, model.viewmats.float().cpu(), strict=True)
+        self._views = [replace(view, viewmat=viewmat) for view, viewmat in pairs]
+        poses = inverse(model.viewmats) * torch.tensor([1.0, -1.0, -1.0, 1.0]).to(model.viewmats)
+        cameras = self.datamanager.train_cameras.camera_to_worlds
+        cameras.copy_(poses[:, :3].to(cameras))
+        self._slack = slack(self._views) if self._slack else 0
+        if due[-1] is PASSES[-1]:
+            change = camera_change(model.viewmats, self._given)
+            self.findings["cameras"] = {**asdict(change), "slack_pixels": [self.datamanager.slack, self._slack]}
+            state = self.datamanager.capture.states[self.datamanager.dataparser.config.state].name
+            self.notes.append(
+                f"{state}: the cameras contradicted each other by {self.datamanager.slack} pixels; they were turned by "
+                f"{change.degrees:.2f} deg and moved by {change.percent:.2f} % of their distance, and now do so by "
+                f"{self._slack}."
+            )
 
     def _vote_at_semantic_start(self, step: int) -> None:
         if step != self.model.config.semantic_start:
             return
-        dataset = self.datamanager.train_dataset
-        views = [dataset.get_view(i) for i in self._labelled()]
+        views = [self._views[i] for i in self._labelled()]
         logits = vote_logits(self.model.splat.detach(), views, self.model.num_parts)
         with torch.no_grad():
             self.model.gauss_params["semantics"].copy_(logits)
