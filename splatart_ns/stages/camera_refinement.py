@@ -19,7 +19,7 @@ from splatart_ns.stages.refinement import STEP, increment, linearized
 TURN, MOVE = math.radians(0.5), 0.005
 """What wrong cameras are usually off by: radians, and shares of their distance."""
 CORRELATED = 300.0
-"""The image counts as so many times fewer pixels: they err together. With 10, cameras went twice as far as they were off."""
+"""The image counts as so many times fewer pixels: they err together. With 10, cameras went twice too far."""
 ITERATIONS = 3
 """Of Gauss-Newton a pass: the splat changes with the cameras, so no pass needs to end."""
 
