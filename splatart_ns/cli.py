@@ -35,7 +35,7 @@ def fit(
     seed: int = 0,
     joint: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     worlds: Literal["shared", "rigid", "similar"] | None = None,
-    refine_cameras: Literal["auto", "on", "off"] = "auto",
+    refine_cameras: Literal["auto", "on", "off"] = "off",
     rasterizer: Rasterizer = "auto",
 ) -> None:
     """Fit an articulated splat to a capture: all stages, resumed after the last finished one.

@@ -34,7 +34,7 @@ SETTINGS = {
     "rasterizer": "auto",
     "joints": [],
     "worlds": "shared",
-    "refine_cameras": "auto",
+    "refine_cameras": "off",
 }
 
 

@@ -66,7 +66,7 @@ class Settings:
     rasterizer: Backend = "auto"
     joints: list[str] = field(default_factory=list)
     worlds: Worlds = "shared"
-    refine_cameras: RefineCameras = "auto"
+    refine_cameras: RefineCameras = "off"
 
 
 class Report:
@@ -164,7 +164,7 @@ def fit(
     rasterizer: Backend = "auto",
     joints: tuple[str, ...] = (),
     worlds: Worlds | None = None,
-    refine_cameras: RefineCameras = "auto",
+    refine_cameras: RefineCameras = "off",
 ) -> Path:
     """Run what is missing of all stages and leave the bundle in `output_dir`.
 

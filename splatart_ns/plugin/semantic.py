@@ -38,7 +38,7 @@ class SemanticModelConfig(SplatartModelConfig):
     max_gaussians: int = 12000
     """Gaussians are not split or duplicated beyond this number."""
     background_color: Literal["random", "black", "white"] = "random"
-    refine_cameras: RefineCameras = "auto"
+    refine_cameras: RefineCameras = "off"
     """Whether the cameras' poses are refined while geometry and colour learn; auto: if no hull fits the images."""
 
 
@@ -172,6 +172,12 @@ class SemanticPipeline(VanillaPipeline):
         self._slack = self.datamanager.slack
         wanted = self.model.config.refine_cameras
         self._refines = wanted == "on" or (wanted == "auto" and self._slack > 0)
+        if self._slack > 0 and not self._refines:
+            state = self.datamanager.capture.states[self.datamanager.dataparser.config.state].name
+            self.notes.append(
+                f"{state}: the silhouettes contradict each other by {self._slack} pixels, so cameras or masks are not "
+                "exact; try --refine-cameras auto."
+            )
         dataset = self.datamanager.train_dataset
         if self.datamanager.test_mode == "val":
             self._views = [dataset.get_view(i) for i in range(len(dataset))]
