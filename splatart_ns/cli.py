@@ -329,6 +329,48 @@ def check(
         raise SystemExit(2)
 
 
+def labels(bundle: Annotated[Path, tyro.conf.Positional], data: Path, output: Path) -> None:
+    """Render part labels for the frames that have none, to be looked at and taken back by `splatart import --labels`.
+
+    Args:
+        bundle: Folder that `splatart fit` left.
+        data: Folder of the capture that it was fitted to.
+        output: A new folder for `labels`, PNGs of part ids, and `overlays`, pictures to look at.
+    """
+    from splatart_ns.bundle import load_bundle
+    from splatart_ns.bundle.rendered_labels import write_labels
+    from splatart_ns.capture.formats import load_capture
+
+    _choose_rasterizer("auto")
+    done = write_labels(load_bundle(bundle), load_capture(data), output, _device())
+    print(f"Labels: {len(done)} frames in {output / 'labels'}; look at {output / 'overlays'}, first at")
+    for one in done[:5]:
+        print(f"  {one.state}/{one.frame.name} ({one.doubtful:.0%} of the object's pixels left unlabelled)")
+    print(f"Take them: splatart import {data} --labels {output / 'labels'} --output-dir LABELLED")
+
+
+def segment(
+    capture: Annotated[Path, tyro.conf.Positional], prompts: Path, output: Path, model: str | None = None
+) -> None:
+    """Make part labels from clicks and boxes with a promptable segmenter; take them by `splatart import --labels`.
+
+    Needs the extra `sam`, and a segmenter on this machine: nothing is downloaded.
+
+    Args:
+        capture: Folder of the capture.
+        prompts: JSON file {"STATE/FRAME": {"part": {"points": [[x, y]], "not": [[x, y]], "box": [x, y, x, y]}}}, pixels
+            from the image's top left corner.
+        output: A new folder for PNGs of part ids.
+        model: Folder of a SAM or SAM 2 for transformers, or its name in Hugging Face's cache.
+    """
+    from splatart_ns.capture import segmenter
+    from splatart_ns.capture.formats import load_capture
+
+    loaded, sam = load_capture(capture), segmenter.Sam(model or segmenter.DEFAULT_MODEL, _device())
+    print(f"Labels: {segmenter.segment(loaded, prompts, output, sam)} frames in {output}")
+    print(f"Take them: splatart import {capture} --labels {output} --output-dir LABELLED")
+
+
 def synth(
     robot: Annotated[Path, tyro.conf.Positional],
     output_dir: Path,
@@ -397,6 +439,7 @@ def main() -> None:
     warnings.filterwarnings("ignore", category=FutureWarning)
     warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True")
     commands = {"fit": fit, "render": render, "view": view, "eval": evaluate, "check": check, "import": import_capture}
+    commands |= {"labels": labels, "segment": segment}
     commands |= {"export": export, "synth": synth, "demo": demo}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="splatart", description=__doc__)

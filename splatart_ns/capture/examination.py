@@ -25,8 +25,9 @@ _PIXELS = 256
 _MOST_FRAMES = 300
 """Of each state; the labelled first, evenly spread."""
 _FEW_FRAMES = 3
-_WRONG_PART = 0.6
-"""A frame's labels are wrong where it contradicts the others on so much of a part, and on so many points of it:"""
+_WRONG_PART, _WRONG_OBJECT = 0.6, 0.3
+"""A frame's labels are wrong where it contradicts the others on so much of a part, or of all parts together, which are
+so many points:"""
 _ENOUGH_POINTS = 30
 _MOST_WRONG = 30
 """So many wrong frames are named of each state."""
@@ -246,18 +247,26 @@ def _check_votes(capture: Capture, one: _Evidence) -> Iterator[Problem]:
     """Labels that contradict the other frames', the worst first; what is wrong has no vote on the next."""
     frames = {id(b): f for f, b in zip((f for f in one.frames if f.labels is not None), one.votes.ballots, strict=True)}
 
-    def worst_part(ballot: Ballot) -> tuple[float, str]:
-        share, number = one.votes.disagreement(ballot)
-        known = [(float(share[i]), name) for i, name in capture.parts.items() if number[i] >= _ENOUGH_POINTS]
-        return max(known, default=(0.0, ""))
+    def worst(ballot: Ballot) -> tuple[float, float, str]:
+        """How far beyond the limit the frame contradicts the others, the share, and of what."""
+        share, number = (x[list(capture.parts)] for x in one.votes.disagreement(ballot))
+        known = [
+            (float(share[k]) / _WRONG_PART, float(share[k]), f"part {name}")
+            for k, name in enumerate(capture.parts.values())
+            if number[k] >= _ENOUGH_POINTS
+        ]
+        if number.sum() >= _ENOUGH_POINTS:
+            whole = float((share * number).sum() / number.sum())
+            known.append((whole / _WRONG_OBJECT, whole, "object"))
+        return max(known, default=(0.0, 0.0, ""))
 
     for _ in range(min(_MOST_WRONG, len(one.votes.ballots))):
-        (share, name), ballot = max(((worst_part(b), b) for b in one.votes.ballots), key=lambda pair: pair[0])
-        if share <= _WRONG_PART:
+        (beyond, share, what), ballot = max(((worst(b), b) for b in one.votes.ballots), key=lambda pair: pair[0])
+        if beyond <= 1:
             return
         frame = frames[id(ballot)]
         one.votes = one.votes.without(ballot)
-        found = f"the labels of {frame.name} contradict the other frames on {share:.0%} of the part {name}"
+        found = f"the labels of {frame.name} contradict the other frames on {share:.0%} of the {what}"
         yield Problem("warning", frame.labels, found, "label it again, or take its semantics_path out")
 
 

@@ -22,13 +22,13 @@ from splatart_ns.capture.capture import (
 )
 from splatart_ns.capture.images import image_size
 from splatart_ns.capture.part_names import read_part_names
+from splatart_ns.capture.peer_layouts import peer_reader
 from splatart_ns.capture.values import (
     inner_path,
-    is_inside,
     parse_camera,
     parse_matrix,
     parse_pose,
-    read_json,
+    read_inner_json,
     relative_path,
     show,
 )
@@ -43,12 +43,13 @@ def load_capture(path: Path | str) -> Capture:
     """Read a capture's structure: states, frames, cameras, splits, part names. No image is decoded but label files
     where `semantic_classes` does not name the parts.
 
-    `path` is a folder in one of three layouts, recognised by its files:
+    `path` is a folder in one of these layouts, recognised by its files:
 
     - subfolders with a `transforms.json` each, one a state, in natural order of their names (`eval` is none);
     - one `transforms.json` whose frames carry `"state": k`;
     - PARIS: `start/` and `end/` with `{train,val,test}/NNNN.png`, `camera_{train,val,test}.json` and optionally
-      `{train,val,test}_semantics/NNNN.png`.
+      `{train,val,test}_semantics/NNNN.png`;
+    - ArtGS's or DTA's (see `peer_layouts`); labels come by `import_labels`.
 
     `train_filenames`, `val_filenames` and `test_filenames` are honoured: a frame that none of them lists is left out,
     one in several counts as train before test before val. Without any of the lists every 8th frame of a state, in
@@ -101,12 +102,14 @@ def read_capture(path: Path | str, report: Report) -> Capture:
         states, metas = _read_single(path / TRANSFORMS, report)
     elif all(os.path.isfile(path / state / "camera_train.json") for state in _PARIS_STATES):
         states, metas = [_read_paris(path / state, path, report) for state in _PARIS_STATES], []
+    elif (read := peer_reader(path)) is not None:
+        states, metas = read(path, report), []
     else:
         raise CaptureError(
             path,
             "there is no capture here",
-            "expected are subfolders with a transforms.json each, one transforms.json, or PARIS's start/ and end/ with "
-            "their camera_train.json",
+            "expected are subfolders with a transforms.json each, one transforms.json, PARIS's start/ and end/ with "
+            "their camera_train.json, or a folder of ArtGS or DTA",
         )
     for state in states:
         if not state.frames:
@@ -169,13 +172,13 @@ def _read_folders(folders: Sequence[Path], root: Path, report: Report) -> tuple[
 
 def _read_state(folder: Path, root: Path, report: Report) -> tuple[State, _Meta]:
     file = folder / TRANSFORMS
-    meta = _read_inside(file, root)
+    meta = read_inner_json(file, root)
     (frames,) = _read_frames(file, root, meta, {0: _entries(file, meta)}, report).values()
     return State(folder.name, frames, _points(file, root, meta)), (file, meta)
 
 
 def _read_single(file: Path, report: Report) -> tuple[list[State], list[_Meta]]:
-    meta = _read_inside(file, file.parent)
+    meta = read_inner_json(file, file.parent)
     entries = _entries(file, meta)
     if not any(isinstance(entry, dict) and "state" in entry for entry in entries):
         mend = 'give every frame "state": 0, 1, ..., or name the folder that holds the state folders'
@@ -200,7 +203,7 @@ def _read_paris(folder: Path, root: Path, report: Report) -> State:
         if not os.path.isfile(file):
             continue
         try:
-            cameras = _read_inside(file, root)
+            cameras = read_inner_json(file, root)
             K = parse_matrix(file, "K", cameras.get("K"), ((3, 3), (4, 4)))
         except CaptureError as error:
             report(error.problem)
@@ -231,12 +234,6 @@ def _paris_frame(file: Path, root: Path, split: str, name: str, pose: Any, K: np
 
 
 # ---------------------------------------------------------------------------------------------- transforms.json
-
-
-def _read_inside(file: Path, root: Path) -> dict[str, Any]:
-    if not is_inside(root, file):
-        raise CaptureError(file, "it is a link out of the capture", "copy what it leads to into the capture")
-    return read_json(file)
 
 
 def _entries(file: Path, meta: dict[str, Any]) -> list[Any]:

@@ -167,6 +167,15 @@ def undistort_labels(labels: np.ndarray, camera: Camera) -> np.ndarray:
     return cv2.remap(labels, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, UNLABELLED)
 
 
+def undistorted_points(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    """Where the rays through pixel positions [N, 2] of a camera, distorted or not, meet the plane at depth 1 [N, 2]."""
+    if not camera.distorted:
+        return (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
+    points = pixels.reshape(-1, 1, 2).astype(np.float64)
+    return cv2.undistortPointsIter(points, camera.K, _opencv_distortion(camera), None, None, criteria)[:, 0]
+
+
 def downscale(image: np.ndarray, factor: int) -> np.ndarray:
     """The image's means over factor x factor pixels, colours weighted by their alpha; the remainder is cut off."""
     if factor == 1:

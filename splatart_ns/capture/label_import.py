@@ -235,14 +235,14 @@ def _part_ids(labels: Path, parts: list[str], classes: Sequence[str]) -> np.ndar
 
 
 def _metas(capture: Capture) -> dict[Path, dict[str, Any]]:
-    """The content of the capture's transforms.json files; of PARIS's folders, what one beside them would hold."""
+    """The content of the capture's transforms.json files; of folders without any, what one in them would hold."""
     files = [path / TRANSFORMS for path in (capture.path, *(capture.path / state.name for state in capture.states))]
     found = {file: read_json(file) for file in files if file.is_file()}
     return found or {files[0]: _transforms(capture)}
 
 
 def _transforms(capture: Capture) -> dict[str, Any]:
-    """A transforms.json for all states that says what PARIS's own files say."""
+    """A transforms.json for all states that says what the files of PARIS, ArtGS or DTA say."""
     frames = []
     lists: dict[str, list[str]] = {"train_filenames": [], "val_filenames": [], "test_filenames": []}
     for k, state in enumerate(capture.states):
@@ -253,8 +253,14 @@ def _transforms(capture: Capture) -> dict[str, Any]:
                 **{"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
                 **{"w": camera.width, "h": camera.height},
             }
-            if frame.labels is not None:
-                entry["semantics_path"] = frame.labels.relative_to(capture.path).as_posix()
+            own = {
+                "semantics_path": frame.labels,
+                "object_mask_path": frame.object_mask,
+                "depth_file_path": frame.depth,
+            }
+            for key, file in own.items():
+                if file is not None:
+                    entry[key] = file.relative_to(capture.path).as_posix()
             frames.append(entry)
             lists[f"{frame.split}_filenames"].append(image)
     return {"camera_model": "PINHOLE", **lists, "frames": frames}

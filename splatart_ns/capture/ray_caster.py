@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatart_ns.capture.capture import Camera
+from splatart_ns.capture.images import undistorted_points
 from splatart_ns.capture.surface import Surface, join
 from splatart_ns.errors import InputError
 
@@ -72,7 +73,7 @@ class RayCaster:
         """One image.
 
         Args:
-            camera: without distortion.
+            camera: pinhole, with or without distortion.
             T_world_camera: [4, 4], OpenGL axes.
             light: what lights the scene.
             samples: rays per pixel along each side; coverage and colour are their mean.
@@ -93,10 +94,10 @@ class RayCaster:
         self, camera: Camera, T_world_camera: np.ndarray, offsets: np.ndarray, light: Light | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Colour [N, 4] (premultiplied; zeros without light), part id [N], depth [N] of the rays at these offsets."""
-        x = ((np.arange(camera.width)[:, None] + offsets).ravel() - camera.cx) / camera.fx
-        y = ((np.arange(camera.height)[:, None] + offsets).ravel() - camera.cy) / camera.fy
+        u, v = ((np.arange(size)[:, None] + offsets).ravel() for size in (camera.width, camera.height))
+        x, y = undistorted_points(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2), camera).T
         # OpenGL cameras look along -z and have y up.
-        local = np.stack([*np.broadcast_arrays(x[None, :], -y[:, None], -1.0)], axis=-1).reshape(-1, 3)
+        local = np.stack([x, -y, np.full_like(x, -1.0)], axis=-1)
         directions = local @ T_world_camera[:3, :3].T
         lengths = np.linalg.norm(directions, axis=-1, keepdims=True)
         directions /= lengths

@@ -60,6 +60,13 @@ def read_json(file: Path) -> dict[str, Any]:
     return value
 
 
+def read_inner_json(file: Path, root: Path) -> dict[str, Any]:
+    """A JSON object of a file that lies in `root`, all links followed."""
+    if not is_inside(root, file):
+        raise CaptureError(file, "it is a link out of the capture", "copy what it leads to into the capture")
+    return read_json(file)
+
+
 def relative_path(file: Path, what: str, value: Any) -> str:
     """A path as JSON gives it, in one spelling: ./a//b is a/b."""
     if not isinstance(value, str) or not value.strip():

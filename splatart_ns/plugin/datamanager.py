@@ -11,7 +11,9 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 
 from splatart_ns.capture.capture import UNLABELLED, Capture
 from splatart_ns.capture.view import View, load_points, load_view
-from splatart_ns.stages.hull import seed_points, slack
+from splatart_ns.stages.hull import SeedPoints, seed_points, slack
+from splatart_ns.stages.silhouette import with_silhouette
+from splatart_ns.stages.surroundings import surrounding_points
 
 
 class CaptureDataset(InputDataset):
@@ -46,7 +48,8 @@ class SplatartDatamanagerConfig(FullImageDatamanagerConfig):
 
     _target: type = field(default_factory=lambda: SplatartDatamanager)
     seed_gaussians: int = 0
-    """Number of points inside the silhouettes to start Gaussians from, when the capture has no point cloud."""
+    """Number of points inside the silhouettes to start Gaussians from, when the capture has no point cloud; and, where
+    images are opaque, at most so many on what surrounds the object, from the point cloud if there is one."""
     seed: int = 0
     """Seed of those points."""
 
@@ -68,23 +71,27 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         return self.dataparser.capture
 
     def _add_seed_points(self) -> None:
-        """Put points where VanillaPipeline looks for them."""
+        """Put points where VanillaPipeline looks for them; none if no image says where the object is."""
         state = self.capture.states[self.dataparser.config.state]
-        views = [self.train_dataset.get_view(i) for i in range(len(self.train_dataset))]
-        silhouettes = all(view.alpha is not None for view in views)
-        if silhouettes:
-            self.slack = slack(views)
+        generator = torch.Generator().manual_seed(self.config.seed)
+        count, num_parts = self.config.seed_gaussians, len(self.capture.parts)
+        points = None
         if state.points is not None:
-            xyz, rgb = load_points(state.points, self.capture.normalization, state.placement)
-        elif not silhouettes:
-            return  # nothing says where the object is: the model starts from random points
+            points = SeedPoints(*load_points(state.points, self.capture.normalization, state.placement))
+        views = [self.train_dataset.get_view(i) for i in range(len(self.train_dataset))]
+        if any(view.alpha is None for view in views):
+            outlined = [v for view in views if (v := with_silhouette(view)) is not None]
+            around = surrounding_points(views, count, generator) if points is None else points.drawn(count, generator)
+            points = seed_points(outlined, num_parts, count, generator) if outlined else None
+            if points is not None:
+                points = points.joined(around)
+                self.train_dataset.metadata["points3D_around"] = len(around.xyz)
         else:
-            generator = torch.Generator().manual_seed(self.config.seed)
-            seeds = seed_points(views, len(self.capture.parts), self.config.seed_gaussians, generator, slack=self.slack)
-            if seeds is None:
-                return
-            xyz, rgb = seeds.xyz, seeds.rgb
-        self.train_dataparser_outputs.metadata.update(points3D_xyz=xyz, points3D_rgb=rgb)
+            self.slack = slack(views)
+            if points is None:
+                points = seed_points(views, num_parts, count, generator, slack=self.slack)
+        if points is not None:
+            self.train_dataparser_outputs.metadata.update(points3D_xyz=points.xyz, points3D_rgb=points.rgb)
 
     def _load_images(self, split, cache_images_device):
         # Pinning needs an accelerator; without one "cpu" and "gpu" are the same memory anyway.

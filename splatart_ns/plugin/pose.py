@@ -18,7 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from splatart_ns.bundle.motion_file import read_motions
-from splatart_ns.capture.capture import UNLABELLED, Capture
+from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.view import View, load_views
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import so3_log
@@ -32,6 +32,8 @@ from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import SUSPECT, initial_motion
+from splatart_ns.stages.semantic import ballots, trusted
+from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
 from splatart_ns.stages.visibility import visibility
 from splatart_ns.stages.world import WorldFit, anchors, fit_worlds, moved_splat, moved_views
 
@@ -139,12 +141,14 @@ class PosePipeline(VanillaPipeline):
         capture = self.datamanager.capture
         runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
         checkpoints = [read_checkpoint(run) for run in runs]
-        self.views: list[list[View]] = [
-            [v.to(device) for view in refined_views(capture, s, checkpoint) if (v := with_silhouette(view)) is not None]
-            for s, checkpoint in enumerate(checkpoints)
-        ]
+        states = [self._load_splat(*pair).to(device) for pair in zip(runs, checkpoints, strict=True)]
+        # The parts are rendered without what surrounds them, so an image must say where the object ends.
+        self.views: list[list[View]] = []
+        for s, (splat, checkpoint) in enumerate(zip(states, checkpoints, strict=True)):
+            views = self._trusted([v.to(device) for v in refined_views(capture, s, checkpoint)], splat)
+            self.views.append([with_silhouette(view) or rendered_silhouette(view, splat) for view in views])
         self._cameras_refined = any(bool(checkpoint["_model.cameras_refined"]) for checkpoint in checkpoints)
-        splats = [self._load_splat(*pair).to(device) for pair in zip(runs, checkpoints, strict=True)]
+        splats = [splat.select(splat.part_ids > 0) for splat in states]
         self.model.worlds = torch.from_numpy(np.stack([state.placement for state in capture.states])).to(device)
         if capture.worlds != "shared":
             self._bring_together(splats, capture)
@@ -154,8 +158,15 @@ class PosePipeline(VanillaPipeline):
         self._pairs = self._shuffled_pairs()
         self._own = self._shuffled_views()
 
+    def _trusted(self, views: list[View], splat: Splat) -> list[View]:
+        """The views of a state, without labels that contradict those of the other views."""
+        labelled = [i for i, view in enumerate(views) if view.labels is not None]
+        kept = trusted(ballots(splat, [views[i] for i in labelled], self.model.num_parts))
+        drop = {i for i, keep in zip(labelled, kept.tolist(), strict=True) if not keep}
+        return [replace(view, labels=None) if i in drop else view for i, view in enumerate(views)]
+
     def _load_splat(self, run: Path, checkpoint: dict[str, Tensor]) -> Splat:
-        """A state's labelled Gaussians without the background's."""
+        """A state's labelled Gaussians."""
         splat = splat_from_state(checkpoint)
         if splat.part_logits.shape[1] != self.model.num_parts + 1:
             raise InputError(
@@ -164,7 +175,7 @@ class PosePipeline(VanillaPipeline):
             )
         if not bool((splat.part_ids > 0).any()):
             raise InputError(f"{run} learned no parts; train splatart-semantic longer, with labelled frames.")
-        return splat.select(splat.part_ids > 0)
+        return splat
 
     def _bring_together(self, splats: list[Splat], capture: Capture) -> None:
         """Move splats and views of all states into the world of state 0."""
@@ -369,18 +380,6 @@ def refined_views(capture: Capture, state: int, checkpoint: dict[str, Tensor]) -
             f"run has {len(viewmats)}; train it again."
         )
     return [replace(view, viewmat=viewmat.float()) for view, viewmat in zip(views, viewmats, strict=True)]
-
-
-def with_silhouette(view: View) -> View | None:
-    """The view with an alpha, for opaque images from their labels; None for one that has neither.
-
-    The parts are rendered without what surrounds them, so an image must say where the object ends.
-    """
-    if view.alpha is not None or view.labels is None:
-        return None if view.alpha is None else view
-    alpha = 255 * ((view.labels > 0) & (view.labels != UNLABELLED)).to(torch.uint8)
-    counts = view.labels != UNLABELLED
-    return replace(view, alpha=alpha, mask=counts if view.mask is None else view.mask & counts)
 
 
 def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:

@@ -10,6 +10,7 @@ from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from splatart_ns.capture.view import View
@@ -19,7 +20,14 @@ from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.rasterize.ssim import l1_ssim_loss
 from splatart_ns.stages.camera_refinement import PASSES, camera_change, refine_cameras
 from splatart_ns.stages.hull import carve, slack
-from splatart_ns.stages.semantic import accumulation_loss, part_image, segmentation_loss, vote_logits
+from splatart_ns.stages.semantic import (
+    accumulation_loss,
+    ballots,
+    part_image,
+    segmentation_loss,
+    trusted,
+    vote_logits,
+)
 
 RefineCameras = Literal["auto", "on", "off"]
 
@@ -36,7 +44,7 @@ class SemanticModelConfig(SplatartModelConfig):
     vote_init: bool = True
     """Whether the logits start from the labels' votes, counted in one backward pass a labelled view."""
     max_gaussians: int = 12000
-    """Gaussians are not split or duplicated beyond this number."""
+    """Gaussians are not split or duplicated beyond this number, and 3 / 2 of those that start on the surroundings."""
     background_color: Literal["random", "black", "white"] = "random"
     refine_cameras: RefineCameras = "off"
     """Whether the cameras' poses are refined while geometry and colour learn; auto: if no hull fits the images."""
@@ -70,6 +78,7 @@ class SemanticModel(SplatartModel):
             verbose=False,
         )
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
+        self._for_surroundings = 3 * self.kwargs["metadata"].get("points3D_around", 0) // 2
         # World to camera, OpenCV axes, of the training frames as they were last refined.
         self.register_buffer("viewmats", torch.eye(4, dtype=torch.float64).repeat(self.num_train_data, 1, 1))
         self.register_buffer("cameras_refined", torch.tensor(False))
@@ -112,7 +121,7 @@ class SemanticModel(SplatartModel):
 
     def _limit_growth(self) -> None:
         """Raise the strategy's threshold so that only the neediest Gaussians that there is room for grow."""
-        room = self.config.max_gaussians - self.num_points
+        room = self.config.max_gaussians + self._for_surroundings - self.num_points
         self.strategy.grow_grad2d = self.config.densify_grad_thresh
         if self.strategy_state["count"] is None or room >= self.num_points:
             return
@@ -168,6 +177,7 @@ class SemanticPipeline(VanillaPipeline):
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         self.notes: list[str] = []
+        self._labelled: set[int] = set()
         self.findings: dict[str, Any] = {}
         self._slack = self.datamanager.slack
         wanted = self.model.config.refine_cameras
@@ -191,17 +201,11 @@ class SemanticPipeline(VanillaPipeline):
             return outputs, self.model.get_loss_dict(outputs, batch), self.model.get_metrics_dict(outputs, batch)
         return super().get_train_loss_dict(step)
 
-    def _labelled(self) -> list[int]:
-        """The training frames with labels."""
-        frames = self.datamanager.train_dataset.metadata["frames"]
-        return [i for i, frame in enumerate(frames) if frame.labels is not None]
-
     def _next_labelled(self, step: int):
-        """The next labelled frame; frames without labels are passed over."""
-        labelled = set(self._labelled())
+        """The next labelled frame that is trusted; others are passed over."""
         while True:
             camera, batch = self.datamanager.next_train(step)
-            if batch["image_idx"] in labelled:
+            if batch["image_idx"] in self._labelled:
                 return camera, batch
 
     def get_training_callbacks(self, training_callback_attributes) -> list[TrainingCallback]:
@@ -216,8 +220,7 @@ class SemanticPipeline(VanillaPipeline):
         if self._refines:
             callbacks.append(TrainingCallback(before, self._refine_cameras))
         callbacks.append(TrainingCallback(before, self._keep_inside))
-        if self.model.config.vote_init:
-            callbacks.append(TrainingCallback(before, self._vote_at_semantic_start))
+        callbacks.append(TrainingCallback(before, self._vote))
         return callbacks
 
     def _keep_inside(self, step: int) -> None:
@@ -252,10 +255,18 @@ class SemanticPipeline(VanillaPipeline):
                 f"{self._slack}."
             )
 
-    def _vote_at_semantic_start(self, step: int) -> None:
-        if step != self.model.config.semantic_start:
+    def _vote(self, step: int) -> None:
+        """Where the second phase begins: which frames' labels to trust, and what they say together."""
+        if step < self.model.config.semantic_start or self._labelled:
             return
-        views = [self._views[i] for i in self._labelled()]
-        logits = vote_logits(self.model.splat.detach(), views, self.model.num_parts)
-        with torch.no_grad():
-            self.model.gauss_params["semantics"].copy_(logits)
+        frames = self.datamanager.train_dataset.metadata["frames"]
+        labelled = [i for i, frame in enumerate(frames) if frame.labels is not None]
+        votes = ballots(self.model.splat.detach(), [self._views[i] for i in labelled], self.model.num_parts)
+        kept = trusted(votes)
+        for i in (labelled[v] for v in (~kept).nonzero()[:, 0].tolist()):
+            self.notes.append(f"{frames[i].labels}: contradicts the other frames' labels and is not used.")
+            CONSOLE.log(self.notes[-1])
+        self._labelled = {labelled[v] for v in kept.nonzero()[:, 0].tolist()}
+        if self.model.config.vote_init and step == self.model.config.semantic_start:
+            with torch.no_grad():
+                self.model.gauss_params["semantics"].copy_(vote_logits(votes[kept]))

@@ -30,6 +30,14 @@ class SeedPoints:
     rgb: Tensor
     """[N, 3] in 0..255, nerfstudio's convention for seed points."""
 
+    def joined(self, other: SeedPoints) -> SeedPoints:
+        return SeedPoints(torch.cat([self.xyz, other.xyz]), torch.cat([self.rgb, other.rgb.to(self.rgb)]))
+
+    def drawn(self, count: int, generator: torch.Generator) -> SeedPoints:
+        """At most `count` of the points, drawn at random."""
+        chosen = torch.randperm(len(self.xyz), generator=generator)[:count]
+        return SeedPoints(self.xyz[chosen], self.rgb[chosen])
+
 
 def carve(views: Sequence[View], grid: Tensor, dilate: int) -> Tensor:
     """Which points [N, 3] lie inside every silhouette, and are seen at all: [N] bool.

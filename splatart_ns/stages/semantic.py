@@ -12,6 +12,10 @@ from splatart_ns.capture.view import View
 from splatart_ns.rasterize.render import Rendering, render
 from splatart_ns.splats.splat import Splat
 
+WRONG_OBJECT = 0.6
+"""A view's labels are wrong where it contradicts the others on so much of the object. Less would not do: of what is
+seen edge on, right labels say something else than Gaussians behind its rim."""
+
 
 def accumulation_loss(accumulation: Tensor, alpha: Tensor) -> Tensor:
     """Mean absolute difference between rendered accumulation and the image's silhouette, both [H, W] in 0..1."""
@@ -36,26 +40,55 @@ def segmentation_loss(probabilities: Tensor, labels: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def vote_logits(splat: Splat, views: Sequence[View], num_parts: int) -> Tensor:
-    """Part logits [N, P + 1] from the labels: the log share of each label in a Gaussian's blending weights.
+def ballots(splat: Splat, views: Sequence[View], num_parts: int) -> Tensor:
+    """How much of its labels' pixels each labelled view sees through each Gaussian [V, N, P + 1]: blending weights.
 
     The gradient of a rendering with respect to P + 1 zero feature channels is the sum of blending weights, so one
-    backward pass a labelled view counts all votes. A Gaussian that no labelled view sees gets equal logits.
+    backward pass a view counts its votes.
     """
-    votes = torch.zeros(len(splat), num_parts + 1, device=splat.means.device)
+    cast = []
     for view in views:
-        if view.labels is None:
-            continue
         view = view.to(splat.means.device)
         labels = view.labels.long()
         labelled = labels != UNLABELLED
         target = torch.nn.functional.one_hot(torch.where(labelled, labels, 0), num_parts + 1).float()
-        features = torch.zeros_like(votes, requires_grad=True)
+        features = torch.zeros(len(splat), num_parts + 1, device=splat.means.device, requires_grad=True)
         with torch.enable_grad():
             image = render(
                 splat, view.viewmat[None], view.K[None], view.width, view.height, features=features, with_depth=False
             ).features[0]
-            (gradient,) = torch.autograd.grad((image * target * labelled[..., None]).sum(), features)
-        votes += gradient
-    share = (votes + 1e-3) / (votes + 1e-3).sum(-1, keepdim=True)
-    return share.log()
+            cast.append(torch.autograd.grad((image * target * labelled[..., None]).sum(), features)[0])
+    return torch.stack(cast) if cast else torch.zeros(0, len(splat), num_parts + 1, device=splat.means.device)
+
+
+def trusted(votes: Tensor) -> Tensor:
+    """Which views' ballots [V, N, P + 1] do not contradict the others: bool [V].
+
+    The view goes that contradicts the others most, as long as one contradicts them on much of the object. Of fewer than
+    three views nobody can tell which is wrong.
+    """
+    kept = torch.ones(len(votes), dtype=torch.bool, device=votes.device)
+    while kept.sum() >= 3:
+        total = votes[kept].sum(0)
+        share = torch.stack(
+            [_contradiction(v, total - v) if k else total.new_zeros(()) for v, k in zip(votes, kept, strict=True)]
+        )
+        if share.max() <= WRONG_OBJECT:
+            break
+        kept[share.argmax()] = False
+    return kept
+
+
+def _contradiction(ballot: Tensor, others: Tensor) -> Tensor:
+    """The share of a ballot's votes [N, P + 1] on the parts' Gaussians, as the others see them, for another label."""
+    amount, part = others.max(-1)
+    counts = (amount > 0) & (part > 0)
+    cast, agreeing = ballot.sum(-1)[counts], ballot.gather(-1, part[:, None])[counts, 0]
+    return (cast - agreeing).sum() / cast.sum().clamp_min(1)
+
+
+def vote_logits(votes: Tensor) -> Tensor:
+    """Part logits [N, P + 1] from ballots [V, N, P + 1]: the log share of each label. A Gaussian that no view sees gets
+    equal logits."""
+    total = votes.sum(0) + 1e-3
+    return (total / total.sum(-1, keepdim=True)).log()

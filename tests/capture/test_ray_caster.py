@@ -1,5 +1,6 @@
 import math
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -117,3 +118,19 @@ def test_a_shadow_falls_where_the_sun_is_hidden(shadows):
     seen = caster.render(CAMERA, above(5.0), Light((1.0, 0.0, 1.0), ambient=0.2, shadows=shadows)).rgba[..., 0]
     shaded, open_ground = int(seen[32, 22]), int(seen[32, 42])
     assert (shaded < 0.5 * open_ground) if shadows else (shaded == open_ground)
+
+
+def test_a_distorted_camera_sees_points_where_opencv_projects_them():
+    camera = Camera(60.0, 58.0, 33.0, 30.0, 64, 64, distortion=(-0.2, 0.05, 0.0, 0.0, 0.004, -0.003))
+    spots = [(0.9, 0.7), (-0.8, 0.5), (0.6, -0.9), (0.0, 0.0)]
+    marks = {
+        i: of_mesh(trimesh.creation.box((0.04, 0.04, 0.01)).apply_translation((x, y, 0.0)))
+        for i, (x, y) in enumerate(spots, start=1)
+    }
+    seen = RayCaster(marks).render(camera, above(2.0), SKY)
+    k1, k2, _, _, p1, p2 = camera.distortion
+    points = np.array([(x, -y, 2.0) for x, y in spots])  # OpenCV axes
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, np.array([k1, k2, p1, p2]))
+    for i, pixel in enumerate(expected[:, 0], start=1):
+        rows, columns = np.nonzero(seen.part_ids == i)
+        assert np.allclose([columns.mean() + 0.5, rows.mean() + 0.5], pixel, atol=0.5)

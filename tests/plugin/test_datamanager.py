@@ -1,3 +1,5 @@
+import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -6,6 +8,8 @@ import torch
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.plugin.datamanager import SplatartDatamanager, SplatartDatamanagerConfig
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
+from splatart_ns.stages.hull import carve
+from splatart_ns.stages.silhouette import with_silhouette
 
 
 def manage(capture: Path, test_mode: str = "val", **settings) -> SplatartDatamanager:
@@ -31,10 +35,25 @@ def test_batches_have_alpha_and_labels_and_frames_without_labels_say_so(capture_
     assert 0 < len(labelled) < len(frames)
 
 
-def test_opaque_images_have_three_channels_and_no_seed_points(opaque_capture_dir: Path) -> None:
+def test_opaque_images_start_from_points_on_the_object_and_on_what_surrounds_it(opaque_capture_dir: Path) -> None:
     manager = manage(opaque_capture_dir, seed_gaussians=100)
     assert manager.next_train(0)[1]["image"].shape == (32, 32, 3)
-    assert "points3D_xyz" not in manager.train_dataparser_outputs.metadata
+    xyz = manager.train_dataparser_outputs.metadata["points3D_xyz"]
+    labelled = [with_silhouette(manager.train_dataset.get_view(i)) for i in range(len(manager.train_dataset))]
+    inside = carve(labelled, xyz, dilate=2)
+    assert inside[:-100].float().mean() > 0.95 and inside[-100:].float().mean() < 0.5
+    assert inside[:-100].sum() >= 100
+
+
+def test_one_labelled_opaque_image_says_where_the_object_may_be(opaque_capture_dir: Path, tmp_path: Path) -> None:
+    capture = shutil.copytree(opaque_capture_dir, tmp_path / "capture")
+    file = capture / "state_01/transforms.json"
+    meta = json.loads(file.read_text())
+    for frame in meta["frames"][1:]:
+        frame.pop("semantics_path")
+    file.write_text(json.dumps(meta))
+    manager = manage(capture, seed_gaussians=100)
+    assert len(manager.train_dataparser_outputs.metadata["points3D_xyz"]) >= 200
 
 
 def test_seed_points_lie_inside_every_silhouette(capture_dir: Path) -> None:

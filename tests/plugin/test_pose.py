@@ -1,18 +1,15 @@
 import copy
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from nerfstudio.engine.trainer import Trainer
 
-from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.check import require_valid
-from splatart_ns.capture.view import load_views
 from splatart_ns.errors import InputError
 from splatart_ns.method_configs.pose import method as pose_method
-from splatart_ns.plugin.pose import find_semantic_runs, with_silhouette
+from splatart_ns.plugin.pose import find_semantic_runs
 
 
 @pytest.fixture(scope="module")
@@ -126,15 +123,3 @@ def test_semantic_runs_that_are_not_there_are_named_by_state(capture_dir, tmp_pa
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="--state 0"):
         find_semantic_runs(capture_dir, 2)
-
-
-def test_an_opaque_view_takes_its_silhouette_from_its_labels(capture_dir):
-    views = load_views(require_valid(capture_dir), 0)
-    view = next(v for v in views if v.labels is not None)
-    assert with_silhouette(view) is view
-    opaque = replace(view, alpha=None, labels=view.labels.clone())
-    opaque.labels[0, 0] = UNLABELLED
-    made = with_silhouette(opaque)
-    assert torch.equal(made.alpha > 0, (view.labels > 0) & (opaque.labels != UNLABELLED))
-    assert not made.mask[0, 0] and made.mask[1, 1]
-    assert with_silhouette(replace(opaque, labels=None)) is None

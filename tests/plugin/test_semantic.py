@@ -1,3 +1,8 @@
+import json
+import shutil
+
+import cv2
+import numpy as np
 import torch
 
 
@@ -41,3 +46,20 @@ def test_only_part_logits_learn_in_the_second_phase(capture_dir, semantic_traine
     trainer.train()
     changed = {name for name, p in model.gauss_params.items() if not torch.equal(p, held[name])}
     assert changed == {"semantics"}
+
+
+def test_gaussians_of_the_surroundings_come_on_top_of_the_limit(opaque_capture_dir, semantic_trainer):
+    model = semantic_trainer(opaque_capture_dir).pipeline.model
+    assert model._for_surroundings == 450  # 3 / 2 of the 300 that start there
+
+
+def test_labels_that_contradict_the_others_are_not_learned(capture_dir, semantic_trainer, tmp_path):
+    capture = shutil.copytree(capture_dir, tmp_path / "capture")
+    meta = json.loads((capture / "state_00/transforms.json").read_text())
+    wrong = next(f for f in meta["frames"] if "semantics_path" in f and f["file_path"] in meta["train_filenames"])
+    file = capture / "state_00" / wrong["semantics_path"]
+    labels = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(file), np.where(labels > 0, 3 - labels, 0).astype(np.uint8))
+    trainer = semantic_trainer(capture, steps=32, semantic_start=30)
+    trainer.train()
+    assert [note.split(":")[0] for note in trainer.pipeline.notes] == [str(file)]

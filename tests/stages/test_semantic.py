@@ -1,13 +1,21 @@
 import math
 from dataclasses import replace
 
+import pytest
 import torch
 from part_scene import box, photograph
 
 from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.semantic import accumulation_loss, part_image, segmentation_loss, vote_logits
+from splatart_ns.stages.semantic import (
+    accumulation_loss,
+    ballots,
+    part_image,
+    segmentation_loss,
+    trusted,
+    vote_logits,
+)
 
 SPLAT = Splat.cat([box(1, (0.9, 0.6, 0.3), (0.0, 0.0, -0.3)), box(2, (0.7, 0.4, 0.12), (0.1, 0.0, 0.2))])
 VIEWS = photograph(SPLAT)
@@ -43,15 +51,38 @@ def test_accumulation_loss_is_the_mean_difference():
 
 def test_votes_find_the_parts_of_visible_gaussians():
     forgotten = replace(SPLAT, part_logits=torch.zeros_like(SPLAT.part_logits))
-    logits = vote_logits(forgotten, VIEWS, 2)
+    logits = vote_logits(ballots(forgotten, VIEWS, 2))
     seen = logits.amax(-1) > math.log(0.9)  # what views agree on
     assert seen.float().mean() > 0.3
     assert (logits.argmax(-1) == SPLAT.part_ids)[seen].float().mean() > 0.99
 
 
-def test_votes_come_from_labelled_views_and_pixels_only():
-    silent = [view.to("cpu") for view in VIEWS]
-    for k, view in enumerate(silent):
-        view.labels = None if k % 2 else torch.full_like(view.labels, UNLABELLED)
-    logits = vote_logits(SPLAT, silent, 2)
+def test_unlabelled_pixels_have_no_vote():
+    silent = [replace(view, labels=torch.full_like(view.labels, UNLABELLED)) for view in VIEWS]
+    logits = vote_logits(ballots(SPLAT, silent, 2))
     assert torch.allclose(logits, logits[:1, :1].expand_as(logits))
+
+
+def swapped(view):
+    return replace(view, labels=torch.where(view.labels > 0, 3 - view.labels, 0))
+
+
+@pytest.mark.parametrize("wrong", [{3}, {1, 5, 6}])
+def test_views_that_contradict_the_others_are_not_trusted(wrong):
+    views = [swapped(view) if i in wrong else view for i, view in enumerate(VIEWS[:9])]
+    kept = trusted(ballots(SPLAT, views, 2))
+    assert {i for i, keep in enumerate(kept.tolist()) if not keep} == wrong
+
+
+def test_right_labels_are_trusted_even_if_their_outlines_are_rough():
+    g = torch.Generator().manual_seed(0)
+    rough = []
+    for view in VIEWS:
+        shift = torch.randint(-1, 2, (2,), generator=g).tolist()
+        rough.append(replace(view, labels=view.labels.roll(shift, (0, 1))))
+    assert trusted(ballots(SPLAT, rough, 2)).all()
+
+
+def test_of_two_views_none_is_called_wrong():
+    assert trusted(ballots(SPLAT, [VIEWS[4], swapped(VIEWS[5])], 2)).all()
+    assert trusted(ballots(SPLAT, [], 2)).shape == (0,)

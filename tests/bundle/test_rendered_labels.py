@@ -1,0 +1,78 @@
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from splatart_ns.bundle import load_bundle
+from splatart_ns.bundle.rendered_labels import _pinhole_pixels, write_labels
+from splatart_ns.capture.capture import Camera
+from splatart_ns.capture.formats import load_capture
+from splatart_ns.capture.images import read_labels, undistorted_points
+from splatart_ns.capture.label_import import import_labels
+from splatart_ns.errors import InputError
+
+
+@pytest.fixture
+def sparse_capture(hinge_capture, tmp_path):
+    """The hinge with labels in its first two training frames of each state alone."""
+    capture = shutil.copytree(hinge_capture, tmp_path / "capture")
+    for file in capture.glob("state_*/transforms.json"):
+        meta = json.loads(file.read_text())
+        for frame in meta["frames"][2:]:
+            frame.pop("semantics_path")
+        file.write_text(json.dumps(meta))
+    return capture
+
+
+def test_unlabelled_frames_get_the_parts_they_show_and_import_takes_them(
+    hinge_fit, hinge_capture, sparse_capture, tmp_path
+):
+    capture, truth = load_capture(sparse_capture), load_capture(hinge_capture)
+    done = write_labels(load_bundle(hinge_fit), capture, tmp_path / "out")
+    assert len(done) == 2 * 12
+    assert [one.doubtful for one in done] == sorted((one.doubtful for one in done), reverse=True)
+    result = import_labels(sparse_capture, tmp_path / "out/labels")
+    assert result.labelled == 24 and result.unmatched == () and list(result.parts) == list(truth.parts.values())
+    overlap = np.zeros((3, 2))
+    for state, true_state in zip(load_capture(sparse_capture).states, truth.states, strict=True):
+        for frame, true_frame in zip(state.frames, true_state.frames, strict=True):
+            labels, expected = read_labels(frame.labels), read_labels(true_frame.labels)
+            for part in (1, 2):
+                known = labels != 255
+                a, b = (labels == part) & known, (expected == part) & known
+                overlap[part] += (a & b).sum(), (a | b).sum()
+    assert (overlap[1:, 0] / overlap[1:, 1] > 0.85).all()
+    overlays = sorted((tmp_path / "out/overlays").rglob("*.jpg"))
+    assert len(overlays) == 24 and cv2.imread(str(overlays[0])).shape == (64, 64, 3)
+
+
+def test_a_labelled_capture_and_another_capture_are_refused(hinge_fit, hinge_capture, sparse_capture, tmp_path):
+    bundle = load_bundle(hinge_fit)
+    with pytest.raises(InputError, match="every frame is labelled"):
+        write_labels(bundle, load_capture(hinge_capture), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    bundle.parts[0].name = "another"
+    with pytest.raises(InputError, match="other states or parts"):
+        write_labels(bundle, load_capture(sparse_capture), tmp_path / "out")
+
+
+def test_a_pixel_without_distortion_is_its_own():
+    column, row, wide = _pinhole_pixels(Camera(50.0, 40.0, 8.0, 6.5, 16, 12))
+    assert (wide.width, wide.height) == (16, 12)
+    assert torch.equal(column, torch.arange(16).expand(12, 16)) and torch.equal(
+        row, torch.arange(12)[:, None].expand(12, 16)
+    )
+
+
+@pytest.mark.parametrize("k1", [-0.3, 0.2])
+def test_the_wide_image_holds_every_pixel_s_ray(k1):
+    camera = Camera(50.0, 52.0, 30.0, 25.0, 64, 48, distortion=(k1, 0.02, 0.0, 0.0, 0.003, 0.001))
+    column, row, wide = _pinhole_pixels(camera)
+    assert 0 <= column.min() and column.max() < wide.width and 0 <= row.min() and row.max() < wide.height
+    rays = undistorted_points(np.array([[0.5, 0.5], [63.5, 47.5], [40.5, 3.5]]), camera)
+    for (u, v), ray in zip([(0, 0), (63, 47), (40, 3)], rays, strict=True):
+        at = np.array([column[v, u], row[v, u]]) + 0.5
+        assert np.abs((at - [wide.cx, wide.cy]) / [wide.fx, wide.fy] - ray).max() < 0.011

@@ -1,0 +1,30 @@
+from dataclasses import replace
+
+import torch
+from part_scene import box, photograph
+
+from splatart_ns.capture.capture import UNLABELLED
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
+
+OBJECT = box(1, (0.5, 0.4, 0.3), (0.0, 0.0, 0.0))
+FLOOR = box(0, (2.0, 2.0, 0.1), (0.0, 0.0, -0.5))
+VIEW = photograph(OBJECT, count=6)[1]
+
+
+def test_an_opaque_image_gets_the_silhouette_of_its_labels():
+    labels = VIEW.labels.clone()
+    labels[0, :5] = UNLABELLED
+    made = with_silhouette(replace(VIEW, alpha=None, labels=labels))
+    assert torch.equal(made.alpha > 0, VIEW.labels > 0) and int(made.alpha.max()) == 255
+    assert not made.mask[0, :5].any() and made.mask.sum() == made.mask.numel() - 5
+    assert with_silhouette(VIEW) is VIEW
+    assert with_silhouette(replace(VIEW, alpha=None, labels=None)) is None
+
+
+def test_surroundings_are_no_part_of_a_rendered_silhouette():
+    opaque = replace(VIEW, alpha=None, labels=None)
+    silhouette = rendered_silhouette(opaque, Splat.cat([OBJECT, FLOOR])).alpha > 127
+    differ = silhouette != (VIEW.labels > 0)
+    assert differ.float().mean() < 0.03 < silhouette.float().mean()
+    assert rendered_silhouette(opaque, FLOOR).alpha.max() < 10
