@@ -34,6 +34,8 @@ def fit(
     root: str | None = None,
     seed: int = 0,
     joint: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    worlds: Literal["shared", "rigid", "similar"] | None = None,
+    refine_cameras: Literal["auto", "on", "off"] = "off",
     rasterizer: Rasterizer = "auto",
 ) -> None:
     """Fit an articulated splat to a capture: all stages, resumed after the last finished one.
@@ -46,12 +48,16 @@ def fit(
         seed: Seed of everything random.
         joint: What you know of a joint, by the parts' names: child:parent, child:parent=revolute (or another type),
             child:parent=none (there is none) or child:parent=not-revolute.
+        worlds: For states that were captured separately: rigid where the device measured lengths, similar where
+            structure from motion gave each its own scale. The states are brought into the world of the first by the
+            part --root, or one that is chosen. By default what the capture says.
+        refine_cameras: Whether to correct the cameras' poses; auto does where the silhouettes contradict each other.
         rasterizer: auto takes gsplat on CUDA, else numba where it is installed, else torch.
     """
     _choose_rasterizer(rasterizer)
     from splatart_ns.plugin.fit import fit as run
 
-    CONSOLE.print(f"Bundle: {run(capture, output_dir, quality, root, seed, rasterizer, joint)}")
+    CONSOLE.print(f"Bundle: {run(capture, output_dir, quality, root, seed, rasterizer, joint, worlds, refine_cameras)}")
 
 
 def batch(

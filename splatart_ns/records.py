@@ -66,12 +66,21 @@ class Record:
     def motions(self, key: str, value: Any, count: int) -> Tensor:
         """Rigid motions [count, 4, 4] as float64."""
         T = self.numbers(key, value, (count, 4, 4))
-        R = T[:, :3, :3]
+        self._check_rigid(key, T, T[:, :3, :3], "rigid motion")
+        return T
+
+    def similarities(self, key: str, count: int) -> Tensor:
+        """Rigid motions with a scale [count, 4, 4] as float64."""
+        T = self.tensor(key, (count, 4, 4))
+        scale = torch.linalg.vector_norm(T[:, :3, :3], dim=1).mean(-1)
+        self._check_rigid(key, T, T[:, :3, :3] / scale.clamp_min(1e-12)[:, None, None], "similarity")
+        return T
+
+    def _check_rigid(self, key: str, T: Tensor, R: Tensor, kind: str) -> None:
         bottom = torch.tensor([0.0, 0.0, 0.0, 1.0]).to(T)
         orthonormal = torch.allclose(R @ R.mT, torch.eye(3).to(T), atol=1e-5)
         if not orthonormal or not (torch.linalg.det(R) > 0).all() or not (T[:, 3] == bottom).all():
-            self.fail(key, "has a matrix that is no rigid motion", "give [R t; 0 0 0 1]")
-        return T
+            self.fail(key, f"has a matrix that is no {kind}", "give [R t; 0 0 0 1]")
 
     def numbers(self, key: str, value: Any, shape: tuple[int, ...]) -> Tensor:
         """Nested lists of exactly this shape, all finite numbers, as float64."""

@@ -27,7 +27,15 @@ def contents(folder):
     return {f.relative_to(folder): (f.read_bytes(), f.stat().st_mtime_ns) for f in folder.rglob("*") if f.is_file()}
 
 
-SETTINGS = {"quality": "draft", "root": None, "seed": 0, "rasterizer": "auto", "joints": []}
+SETTINGS = {
+    "quality": "draft",
+    "root": None,
+    "seed": 0,
+    "rasterizer": "auto",
+    "joints": [],
+    "worlds": "shared",
+    "refine_cameras": "off",
+}
 
 
 def results(folder):

@@ -107,6 +107,9 @@ def load_bundle(folder: Path) -> Bundle:
     joints = [_read_joint(record, len(states), names) for record in top.records("joints")]
     _check_unique(top, "joints", [joint.name for joint in joints])
 
+    provenance = top.record("provenance")
+    if "worlds" in provenance.fields:
+        provenance.similarities("worlds", len(states))
     bundle = Bundle(
         parts=sorted(parts, key=lambda part: part.id),
         joints=joints,
@@ -114,7 +117,7 @@ def load_bundle(folder: Path) -> Bundle:
         states=states,
         length_unit=top.record("units").text("length"),
         loops=[_read_loop(record, joints, names) for record in top.records("loops")],
-        provenance=top.record("provenance").fields,
+        provenance=provenance.fields,
     )
     if (angle := top.record("units").text("angle")) != "radian":
         top.fail("units.angle", f"is '{angle}'", "angles of a bundle are in radians")

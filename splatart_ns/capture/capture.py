@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from splatart_ns.errors import InputError
 
+Worlds = Literal["shared", "rigid", "similar"]
+"""How the states' worlds differ: not at all, by a rigid motion (a device measured lengths), or by one with a scale."""
 UNLABELLED = 255
 """The label of a pixel that nobody labelled."""
 
@@ -105,10 +109,16 @@ class State:
     name: str
     frames: tuple[Frame, ...]
     points: Path | None = None
-    """A point cloud (PLY) of the object at this state."""
+    """A point cloud (PLY) of the object at this state, in the world that the state came in."""
+    placement: np.ndarray = field(default_factory=lambda: np.eye(4))
+    """The similarity [4, 4] that brought the frames' poses from that world (see `worlds`)."""
 
     def split(self, name: str) -> tuple[Frame, ...]:
         return tuple(f for f in self.frames if f.split == name)
+
+    def normalization(self) -> Normalization:
+        """The one that this state's cameras alone suggest."""
+        return Normalization.from_frames(self.frames)
 
 
 @dataclass(frozen=True)
@@ -120,6 +130,7 @@ class Capture:
     parts: dict[int, str]
     """Part id to name, in order of id, without the background."""
     length_unit: str = "unknown"
+    worlds: Worlds = "shared"
     normalization: Normalization = field(default_factory=lambda: Normalization(np.zeros(3), 1.0))
 
 
@@ -130,6 +141,12 @@ class Normalization:
     centre: np.ndarray
     """[3] float64, in the capture's unit."""
     scale: float
+
+    @staticmethod
+    def from_frames(frames: Sequence[Frame]) -> Normalization:
+        """That of the frames' cameras."""
+        half_fov = [math.atan(min(c.width / c.fx, c.height / c.fy) / 2) for c in (f.camera for f in frames)]
+        return Normalization.from_cameras(np.stack([f.T_world_camera for f in frames]), np.array(half_fov))
 
     @staticmethod
     def from_cameras(T_world_camera: np.ndarray, half_fov: np.ndarray) -> Normalization:
@@ -165,7 +182,7 @@ class Normalization:
         """A rigid motion [..., 4, 4] of the normalised world as a motion of the capture's world."""
         out = T.copy()
         R, t = T[..., :3, :3], T[..., :3, 3]
-        out[..., :3, 3] = t / self.scale + self.centre - R @ self.centre
+        out[..., :3, 3] = t / self.scale + self.centre - R @ self.centre  # also right for similarities
         return out
 
     def motion_to_normal(self, T: np.ndarray) -> np.ndarray:

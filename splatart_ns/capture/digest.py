@@ -10,7 +10,7 @@ from splatart_ns.capture.capture import Capture, State
 
 def capture_digest(capture: Capture, states: Sequence[State] | None = None) -> str:
     """SHA-256 of all that a fit reads of a capture, or of some of its states alone; not of where the files lie."""
-    digest = hashlib.sha256(repr((capture.parts, capture.length_unit)).encode())
+    digest = hashlib.sha256(repr((capture.parts, capture.length_unit, capture.worlds)).encode())
     for state in capture.states if states is None else states:
         digest.update(state.name.encode() + (state.points.read_bytes() if state.points else b""))
         for frame in state.frames:

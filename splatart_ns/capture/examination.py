@@ -125,7 +125,8 @@ def examine(path: Path | str, suggest: int = 0) -> Examination:
     - Silhouettes: whether any point projects inside all of them, and which do not fit the others' visual hull.
     - Labels: frames that contradict the other frames on a part, by votes on the hull's surface; outlines of labels
       against silhouettes; parts that few labelled frames show.
-    - States: whether a part moved, and whether one stayed, between the first state and the others.
+    - States: whether a part moved, and whether one stayed, between the first state and the others, if these share a
+      world.
 
     `suggest` frames to label next are chosen one after the other: the training frame that adds most to
     sum_v w_v (1 - 2^-n_v), where n_v labelled frames see the point v of the surface and w_v = 1 / (points of its part),
@@ -146,7 +147,7 @@ def examine(path: Path | str, suggest: int = 0) -> Examination:
             one.votes = vote(one.labelled, one.points, one.size, num_parts)
             problems.extend(_check_votes(capture, one))
         problems.extend(_check_coverage(capture, one))
-    for other in evidence[1:]:
+    for other in evidence[1:] if capture.worlds == "shared" else ():
         problems.extend(_check_motion(capture, evidence[0], other))
     return Examination(
         capture=capture,
@@ -162,9 +163,7 @@ def _read_evidence(state: State) -> _Evidence:
         labelled = sum(frame.labels is not None for frame in frames)
         head, rest = frames[:labelled], frames[labelled:]
         frames = _spread(head, _MOST_FRAMES) + _spread(rest, max(0, _MOST_FRAMES - labelled))
-    T = np.stack([frame.T_world_camera for frame in frames])
-    half = [math.atan(min(c.width / c.fx, c.height / c.fy) / 2) for c in (frame.camera for frame in frames)]
-    normalization = Normalization.from_cameras(T, np.array(half))
+    normalization = Normalization.from_frames(frames)
 
     def read(frame: Frame) -> View | None:
         try:
@@ -329,7 +328,7 @@ def _check_motion(capture: Capture, first: _Evidence, other: _Evidence) -> Itera
         )
     if len(known) and bool((known < _MOVES).all()):
         found = f"no part is where it was in {first.state.name}: the states may have different worlds or labels"
-        mend = "give all poses in one world, for instance by one run of COLMAP over all images, and all parts one id"
+        mend = "fit it with --worlds similar (rigid if lengths are measured), or correct the ids of the parts"
         yield Problem("warning", place, found, mend)
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from splatart_ns.capture.capture import (
     Problem,
     Report,
     State,
+    Worlds,
 )
 from splatart_ns.capture.images import image_size
 from splatart_ns.capture.part_names import read_part_names
@@ -36,6 +36,7 @@ from splatart_ns.capture.values import (
 TRANSFORMS = "transforms.json"
 SPLITS = ("train", "val", "test")
 _PARIS_STATES = ("start", "end")
+_Meta = tuple[Path, dict[str, Any]]
 
 
 def load_capture(path: Path | str) -> Capture:
@@ -122,12 +123,22 @@ def read_capture(path: Path | str, report: Report) -> Capture:
         path=path,
         states=tuple(states),
         parts=read_part_names(metas, frames, report),
+        worlds=_worlds(metas, report),
         length_unit=next((unit for _, m in metas if isinstance(unit := m.get("length_unit"), str)), "unknown"),
-        normalization=Normalization.from_cameras(
-            np.stack([f.T_world_camera for f in frames]),
-            np.array([math.atan(min(c.width / c.fx, c.height / c.fy) / 2) for c in (f.camera for f in frames)]),
-        ),
+        normalization=Normalization.from_frames(frames),
     )
+
+
+def _worlds(metas: Sequence[_Meta], report: Report) -> Worlds:
+    """What the first transforms.json that has one gives as "worlds"."""
+    for file, meta in metas:
+        if "worlds" not in meta:
+            continue
+        if meta["worlds"] in get_args(Worlds):
+            return meta["worlds"]
+        found, mend = f'"worlds" is {show(meta["worlds"])}', f"write one of {', '.join(get_args(Worlds))}"
+        report(Problem("error", file, found, mend))
+    return "shared"
 
 
 # ---------------------------------------------------------------------------------------------- layouts
@@ -144,9 +155,6 @@ def _subfolders(path: Path) -> list[Path]:
         return [int(s) if i % 2 else s for i, s in enumerate(pieces)], folder.name
 
     return sorted(found, key=key)
-
-
-_Meta = tuple[Path, dict[str, Any]]
 
 
 def _read_folders(folders: Sequence[Path], root: Path, report: Report) -> tuple[list[State], list[_Meta]]:

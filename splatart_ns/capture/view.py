@@ -116,9 +116,10 @@ def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) ->
     )
 
 
-def load_points(path: Path, normalization: Normalization) -> tuple[Tensor, Tensor]:
+def load_points(path: Path, normalization: Normalization, placement: np.ndarray | None = None) -> tuple[Tensor, Tensor]:
     """A point cloud (PLY) in the normalised world: float32 [N, 3], and uint8 colours [N, 3], grey where it has none.
 
+    `placement` [4, 4] brings its world to the capture's.
     Raises `InputError` if it cannot be read or is empty.
     """
     try:  # from bytes: a file could name a texture elsewhere
@@ -132,5 +133,7 @@ def load_points(path: Path, normalization: Normalization) -> tuple[Tensor, Tenso
         raise CaptureError(path, found, "write it again as a PLY of points, or take ply_file_path out") from None
     if len(xyz) == 0 or not np.isfinite(xyz).all():
         raise CaptureError(path, "the point cloud is empty or not finite", "write it again, or take ply_file_path out")
+    if placement is not None:
+        xyz = xyz @ placement[:3, :3].T + placement[:3, 3]
     rgb = rgb[:, :3].astype(np.uint8) if len(rgb) == len(xyz) else np.full(xyz.shape, 128, np.uint8)
     return torch.from_numpy(normalization.scale * (xyz - normalization.centre)).float(), torch.from_numpy(rgb)

@@ -14,6 +14,7 @@ from splatart_ns.bundle.posing import observed_motions
 from splatart_ns.capture.capture import Capture, State
 from splatart_ns.capture.formats import load_capture, load_novel
 from splatart_ns.capture.view import load_views
+from splatart_ns.capture.worlds import in_one_world
 from splatart_ns.errors import InputError
 from splatart_ns.evaluation.geometry import chamfer_centres, chamfer_mesh
 from splatart_ns.evaluation.ground_truth import GroundTruth, load_ground_truth
@@ -42,6 +43,8 @@ def evaluate(bundle_folder: Path, capture_path: Path, device: torch.device | str
             f"{bundle_folder / ARTICULATION}: has {len(bundle.states)} states but {capture_path} has "
             f"{len(capture.states)}; evaluate a bundle on the capture that it was fitted to"
         )
+    if "worlds" in bundle.provenance:
+        capture = in_one_world(capture, bundle.provenance["worlds"])
     truth = load_ground_truth(capture_path)
     notes = ["images.lpips: its network's weights are not part of this package"]
     metrics: dict[str, Any] = {

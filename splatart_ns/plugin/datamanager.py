@@ -11,7 +11,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 
 from splatart_ns.capture.capture import UNLABELLED, Capture
 from splatart_ns.capture.view import View, load_points, load_view
-from splatart_ns.stages.hull import SeedPoints, seed_points
+from splatart_ns.stages.hull import SeedPoints, seed_points, slack
 from splatart_ns.stages.silhouette import with_silhouette
 from splatart_ns.stages.surroundings import surrounding_points
 
@@ -61,6 +61,8 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
 
     def __init__(self, config: SplatartDatamanagerConfig, *args, test_mode: str = "val", **kwargs):
         super().__init__(config, *args, test_mode=test_mode, **kwargs)
+        self.slack = 0
+        """By how many pixels the silhouettes contradict each other (see `stages.hull.slack`)."""
         if config.seed_gaussians > 0 and test_mode == "val":  # otherwise a checkpoint brings the Gaussians
             self._add_seed_points()
 
@@ -72,18 +74,22 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         """Put points where VanillaPipeline looks for them; none if no image says where the object is."""
         state = self.capture.states[self.dataparser.config.state]
         generator = torch.Generator().manual_seed(self.config.seed)
-        count = self.config.seed_gaussians
-        points = None if state.points is None else SeedPoints(*load_points(state.points, self.capture.normalization))
+        count, num_parts = self.config.seed_gaussians, len(self.capture.parts)
+        points = None
+        if state.points is not None:
+            points = SeedPoints(*load_points(state.points, self.capture.normalization, state.placement))
         views = [self.train_dataset.get_view(i) for i in range(len(self.train_dataset))]
         if any(view.alpha is None for view in views):
             outlined = [v for view in views if (v := with_silhouette(view)) is not None]
             around = surrounding_points(views, count, generator) if points is None else points.drawn(count, generator)
-            points = seed_points(outlined, len(self.capture.parts), count, generator) if outlined else None
+            points = seed_points(outlined, num_parts, count, generator) if outlined else None
             if points is not None:
                 points = points.joined(around)
                 self.train_dataset.metadata["points3D_around"] = len(around.xyz)
-        elif points is None:
-            points = seed_points(views, len(self.capture.parts), count, generator)
+        else:
+            self.slack = slack(views)
+            if points is None:
+                points = seed_points(views, num_parts, count, generator, slack=self.slack)
         if points is not None:
             self.train_dataparser_outputs.metadata.update(points3D_xyz=points.xyz, points3D_rgb=points.rgb)
 

@@ -10,9 +10,10 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
-from splatart_ns.capture.capture import Capture
+from splatart_ns.capture.capture import Capture, Worlds
 from splatart_ns.capture.check import require_valid
 from splatart_ns.capture.images import undistorted_camera
+from splatart_ns.capture.worlds import focus_on_focus
 from splatart_ns.errors import InputError
 
 
@@ -23,6 +24,8 @@ class SplatartDataParserConfig(DataParserConfig):
     _target: type = field(default_factory=lambda: SplatartDataParser)
     state: int = 0
     """Which state of the object, counted from 0 in the order of the state folders."""
+    worlds: Worlds | None = None
+    """How the states' worlds differ; what the capture says when not given, and else shared."""
 
 
 @dataclass
@@ -37,7 +40,7 @@ class SplatartDataParser(DataParser):
 
     @property
     def capture(self) -> Capture:
-        """The whole capture; checked when it is first read.
+        """The whole capture, states of separate worlds side by side; checked when it is first read.
 
         Raises:
             InputError: for a capture that cannot be used, or a state that it does not have.
@@ -49,7 +52,7 @@ class SplatartDataParser(DataParser):
                     f"{self.config.data} has no state {self.config.state}; "
                     f"choose --state between 0 and {len(capture.states) - 1}."
                 )
-            self._capture = capture
+            self._capture = focus_on_focus(capture, self.config.worlds or capture.worlds)
         return self._capture
 
     def _generate_dataparser_outputs(self, split: str = "train", **_) -> DataparserOutputs:

@@ -9,7 +9,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -21,7 +21,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from splatart_ns.bundle import load_bundle
-from splatart_ns.capture.capture import Capture
+from splatart_ns.capture.capture import Capture, Worlds
 from splatart_ns.capture.check import require_valid
 from splatart_ns.capture.digest import capture_digest
 from splatart_ns.errors import InputError
@@ -29,6 +29,7 @@ from splatart_ns.files import write_json
 from splatart_ns.method_configs.joint import method as joint_method
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.method_configs.semantic import method as semantic_method
+from splatart_ns.plugin.semantic import RefineCameras
 from splatart_ns.plugin.stage_run import Outcome, num_processes, run_side_by_side, run_stage
 from splatart_ns.rasterize.rasterization import Backend, default_backend, set_backend
 from splatart_ns.stages.joint_constraint import parse_constraints
@@ -64,6 +65,12 @@ class Settings:
     seed: int
     rasterizer: Backend = "auto"
     joints: list[str] = field(default_factory=list)
+    worlds: Worlds | None = None
+    refine_cameras: RefineCameras = "off"
+
+    def of(self, capture: Capture) -> Settings:
+        """With what the capture says where nothing else was asked for."""
+        return replace(self, worlds=self.worlds or capture.worlds)
 
 
 def report_head(capture: Capture, settings: Settings) -> dict[str, Any]:
@@ -71,7 +78,7 @@ def report_head(capture: Capture, settings: Settings) -> dict[str, Any]:
     return {
         "capture": str(capture.path.absolute()),
         "capture_sha256": capture_digest(capture),
-        "settings": asdict(settings),
+        "settings": asdict(settings.of(capture)),
         "seed": settings.seed,
         "device": "cuda: " + torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
         "rasterizer": default_backend(),
@@ -107,7 +114,7 @@ class Report:
             ]
             had, wanted = earlier["settings"], self.data["settings"]
             same = all(earlier.get(key) == self.data[key] for key in ("capture", "capture_sha256"))
-            last = ("root", "joints")  # the last stage alone asks for them
+            last = ("root", "joints") if wanted["worlds"] == "shared" else ("joints",)  # the last stage alone asks
             same = same and {k: v for k, v in had.items() if k not in last} == {
                 k: v for k, v in wanted.items() if k not in last
             }
@@ -151,6 +158,8 @@ def fit(
     seed: int = 0,
     rasterizer: Backend = "auto",
     joints: tuple[str, ...] = (),
+    worlds: Worlds | None = None,
+    refine_cameras: RefineCameras = "off",
 ) -> Path:
     """Run what is missing of all stages and leave the bundle in `output_dir`.
 
@@ -158,7 +167,7 @@ def fit(
         InputError: for a capture, a root, a joint, a folder or a rasterizer that cannot be used.
     """
     set_backend(rasterizer)
-    settings = Settings(quality, root, seed, rasterizer, list(joints))
+    settings = Settings(quality, root, seed, rasterizer, list(joints), worlds, refine_cameras)
     capture = require_fittable(capture_path, settings)
     output_dir = output_dir.absolute()
     report = Report(output_dir / "report.json", capture, settings)
@@ -199,7 +208,7 @@ def require_fittable(capture_path: Path, settings: Settings) -> Capture:
 
 def stage_configs(capture: Capture, bundle: Path, settings: Settings) -> dict[str, TrainerConfig]:
     """Every stage by its name, in order: `semantic STATE` of each state, `pose`, `joint`; runs are below the bundle."""
-    runs = bundle / "runs"
+    runs, settings = bundle / "runs", settings.of(capture)
     semantic = [_semantic_config(capture, index, runs, settings) for index in range(len(capture.states))]
     pose = _pose_config(capture, [_config_file(config) for config in semantic], runs, settings)
     joint = _joint_config(capture, _config_file(pose), runs, settings)
@@ -212,12 +221,13 @@ def _semantic_config(capture: Capture, state: int, runs: Path, settings: Setting
     part_steps = config.max_num_iterations - config.pipeline.model.semantic_start
     config.max_num_iterations = effort.steps + part_steps
     config.pipeline.model.semantic_start = effort.steps
+    config.pipeline.model.refine_cameras = settings.refine_cameras
     config.pipeline.model.stop_split_at = 7 * effort.steps // 10
     config.pipeline.model.max_gaussians = 3 * effort.gaussians // 2
     _set_decay(config, effort.steps)
     config.pipeline.datamanager.seed_gaussians = effort.gaussians
     config.pipeline.datamanager.seed = settings.seed
-    return _placed(config, capture, state, runs, capture.states[state].name, settings.seed)
+    return _placed(config, capture, state, runs, capture.states[state].name, settings)
 
 
 def _pose_config(capture: Capture, semantic_runs: list[Path], runs: Path, settings: Settings) -> TrainerConfig:
@@ -226,7 +236,9 @@ def _pose_config(capture: Capture, semantic_runs: list[Path], runs: Path, settin
     config.pipeline.seed = settings.seed
     config.max_num_iterations = config.pipeline.model.pose_steps + EFFORTS[settings.quality].merge_steps
     _set_decay(config, config.max_num_iterations)
-    return _placed(config, capture, 0, runs, "all", settings.seed)
+    if settings.worlds != "shared":
+        config.pipeline.root = settings.root
+    return _placed(config, capture, 0, runs, "all", settings)
 
 
 def _joint_config(capture: Capture, pose_run: Path, runs: Path, settings: Settings) -> TrainerConfig:
@@ -237,18 +249,19 @@ def _joint_config(capture: Capture, pose_run: Path, runs: Path, settings: Settin
     config.pipeline.joints = tuple(settings.joints)
     config.pipeline.seed = settings.seed
     config.pipeline.settings = asdict(settings)
-    return _placed(config, capture, 0, runs, "all", settings.seed)
+    return _placed(config, capture, 0, runs, "all", settings)
 
 
 def _placed(
-    config: TrainerConfig, capture: Capture, state: int, runs: Path, experiment: str, seed: int
+    config: TrainerConfig, capture: Capture, state: int, runs: Path, experiment: str, settings: Settings
 ) -> TrainerConfig:
     """With its capture, its run folder, and none of what `ns-train` shows and saves meanwhile."""
     config.data = capture.path.absolute()
     config.pipeline.datamanager.data = config.data
     config.pipeline.datamanager.dataparser.data = config.data
     config.pipeline.datamanager.dataparser.state = state
-    config.machine.seed = seed
+    config.pipeline.datamanager.dataparser.worlds = settings.worlds
+    config.machine.seed = settings.seed
     config.output_dir = runs
     config.experiment_name = experiment
     config.timestamp = "fit"

@@ -263,7 +263,12 @@ class JointPipeline(VanillaPipeline):
             capture.parts,
             [s.name for s in capture.states],
             capture.length_unit,
-            {"version": version("splatart-ns"), "seed": config.seed, "settings": config.settings},
+            {
+                "version": version("splatart-ns"),
+                "seed": config.seed,
+                "settings": config.settings,
+                **({} if capture.worlds == "shared" else {"worlds": state["_model.worlds"].tolist()}),
+            },
         )
 
 
@@ -275,9 +280,8 @@ def surface_points(splat: Splat) -> Tensor:
 
 def splat_to_world(splat: Splat, normalization: Normalization) -> Splat:
     """A splat of the normalised world in the capture's unit."""
-    out = splat.detach()
-    out.means = out.means / normalization.scale + torch.from_numpy(normalization.centre).to(out.means)
-    out.log_scales = out.log_scales - math.log(normalization.scale)
+    out = splat.detach().scaled(1 / normalization.scale)
+    out.means = out.means + torch.from_numpy(normalization.centre).to(out.means)
     return out
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
@@ -16,8 +18,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from splatart_ns.bundle.motion_file import read_motions
+from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.view import View, load_views
 from splatart_ns.errors import InputError
+from splatart_ns.geometry.se3 import so3_log
+from splatart_ns.geometry.similarity import scale_of
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_config
 from splatart_ns.plugin.gaussians import gauss_params_from_splat, splat_from_state
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
@@ -26,10 +31,11 @@ from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
-from splatart_ns.stages.render_choice import initial_motion
+from splatart_ns.stages.render_choice import SUSPECT, initial_motion
 from splatart_ns.stages.semantic import ballots, trusted
 from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
 from splatart_ns.stages.visibility import visibility
+from splatart_ns.stages.world import WorldFit, anchors, fit_worlds, moved_splat, moved_views
 
 
 @dataclass
@@ -58,6 +64,7 @@ class PoseModel(SplatartModel):
         self.register_buffer("merged", torch.tensor(False))
         self.register_buffer("covariance", torch.zeros(1, self.num_parts, 6, 6, dtype=torch.float64))
         self.register_buffer("held_ratio", torch.full((self.num_parts, self.num_parts), torch.nan))
+        self.register_buffer("worlds", torch.eye(4, dtype=torch.float64)[None])
         eye = torch.eye(4, dtype=torch.float64).repeat(1, self.num_parts, 1, 1)
         self.poses = PartPoses(eye, torch.zeros(self.num_parts, 3), torch.ones(self.num_parts))
 
@@ -92,7 +99,7 @@ class PoseModel(SplatartModel):
         return self.splat_at(self.state, self.poses.T())
 
     def load_state_dict(self, state, **kwargs):
-        for name in ("state_ids", "covariance", "held_ratio"):
+        for name in ("state_ids", "covariance", "held_ratio", "worlds"):
             setattr(self, name, torch.zeros_like(state[name], device=self.device))
         base = state["poses.base"].to(self.device)
         eye = torch.eye(4, dtype=torch.float64, device=self.device).expand_as(base).clone()
@@ -114,6 +121,8 @@ class PosePipelineConfig(VanillaPipelineConfig):
     """A bundle's articulation.json, or another JSON file with the parts' motions in the same form."""
     snap: bool = True
     """Whether parts whose images fit no motion are held still."""
+    root: str | None = None
+    """Where the states have worlds of their own: name of the part that brings them together; chosen when not given."""
     seed: int = 0
     """Seed of the registration and of the order of views."""
 
@@ -126,36 +135,39 @@ class PosePipeline(VanillaPipeline):
     def __init__(self, config: PosePipelineConfig, device: str, test_mode: str = "val", *args, **kwargs):
         super().__init__(config, device, test_mode, *args, **kwargs)
         self.notes: list[str] = []
+        self.findings: dict[str, Any] = {}
         if test_mode != "val":  # a checkpoint brings everything
             return
         capture = self.datamanager.capture
         runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
-        states = [self._load_splat(run).to(device) for run in runs]
+        checkpoints = [read_checkpoint(run) for run in runs]
+        states = [self._load_splat(*pair).to(device) for pair in zip(runs, checkpoints, strict=True)]
         # The parts are rendered without what surrounds them, so an image must say where the object ends.
-        self.views: list[list[View]] = [
-            [with_silhouette(view) or rendered_silhouette(view, splat) for view in self._trusted_views(s, splat)]
-            for s, splat in enumerate(states)
-        ]
+        self.views: list[list[View]] = []
+        for s, (splat, checkpoint) in enumerate(zip(states, checkpoints, strict=True)):
+            views = self._trusted([v.to(device) for v in refined_views(capture, s, checkpoint)], splat)
+            self.views.append([with_silhouette(view) or rendered_silhouette(view, splat) for view in views])
+        self._cameras_refined = any(bool(checkpoint["_model.cameras_refined"]) for checkpoint in checkpoints)
         splats = [splat.select(splat.part_ids > 0) for splat in states]
+        self.model.worlds = torch.from_numpy(np.stack([state.placement for state in capture.states])).to(device)
+        if capture.worlds != "shared":
+            self._bring_together(splats, capture)
         S, P = len(splats), self.model.num_parts
         self._reference, self._known, self._frozen = [0] * P, torch.ones(S, P, dtype=torch.bool), torch.zeros(S, P) > 0
         self.model.start(splats, self._initial_poses(splats), self._frozen)
         self._pairs = self._shuffled_pairs()
         self._own = self._shuffled_views()
 
-    def _trusted_views(self, state: int, splat: Splat) -> list[View]:
-        """The training views of a state, without labels that contradict those of the other views."""
-        views = [view.to(splat.means.device) for view in load_views(self.datamanager.capture, state, "train")]
+    def _trusted(self, views: list[View], splat: Splat) -> list[View]:
+        """The views of a state, without labels that contradict those of the other views."""
         labelled = [i for i, view in enumerate(views) if view.labels is not None]
         kept = trusted(ballots(splat, [views[i] for i in labelled], self.model.num_parts))
-        for i, keep in zip(labelled, kept.tolist(), strict=True):
-            if not keep:
-                views[i] = replace(views[i], labels=None)
-        return views
+        drop = {i for i, keep in zip(labelled, kept.tolist(), strict=True) if not keep}
+        return [replace(view, labels=None) if i in drop else view for i, view in enumerate(views)]
 
-    def _load_splat(self, run: Path) -> Splat:
+    def _load_splat(self, run: Path, checkpoint: dict[str, Tensor]) -> Splat:
         """A state's labelled Gaussians."""
-        splat = splat_from_state(read_checkpoint(run))
+        splat = splat_from_state(checkpoint)
         if splat.part_logits.shape[1] != self.model.num_parts + 1:
             raise InputError(
                 f"{run} was trained with {splat.part_logits.shape[1] - 1} parts and the capture has "
@@ -164,6 +176,30 @@ class PosePipeline(VanillaPipeline):
         if not bool((splat.part_ids > 0).any()):
             raise InputError(f"{run} learned no parts; train splatart-semantic longer, with labelled frames.")
         return splat
+
+    def _bring_together(self, splats: list[Splat], capture: Capture) -> None:
+        """Move splats and views of all states into the world of state 0."""
+        P = self.model.num_parts
+        seen = [visibility(s, v) for s, v in zip(splats, self.views, strict=True)]
+        root = next((p for p, name in capture.parts.items() if name == self.config.root), None)
+        parts = anchors(splats, seen, P) if root is None else [root]
+        found = fit_worlds(splats, self.views, seen, parts, capture.worlds == "similar", self.config.seed)
+        if found is None:
+            raise InputError(
+                f"{capture.path}: no part is seen well enough in all states to bring their worlds together; label "
+                "a part in more frames of every state, or name one by --root."
+            )
+        part, fits = found
+        self.findings["worlds"] = []
+        for k, fit in enumerate(fits, start=1):
+            splats[k] = moved_splat(splats[k], fit.T)
+            self.views[k] = moved_views(self.views[k], fit.T)
+            to_first = torch.from_numpy(capture.normalization.motion_to_world(fit.T.numpy(force=True)))
+            self.model.worlds[k] = to_first.to(self.model.worlds) @ self.model.worlds[k]
+            told = world_record(capture.states[k].name, self.model.part_names[part], self.model.worlds[k], fit)
+            self.findings["worlds"].append(told)
+            self.notes.append(world_sentence(told, capture.states[0].name))
+            CONSOLE.log(self.notes[-1])
 
     def _initial_poses(self, splats: list[Splat]) -> Tensor:
         """Poses [S, P, 4, 4] to begin from; keeps in mind the reference states, and what is known and what stays."""
@@ -176,6 +212,8 @@ class PosePipeline(VanillaPipeline):
             M[..., :3, 3] = centroids - centroids[0]
             return M
         seen = [visibility(s, v) for s, v in zip(splats, self.views, strict=True)]
+        # Where cameras were refined, each state has kept the mean error of its own: what rests seems to move by that.
+        snap = self.config.snap and not self._cameras_refined
         self._reference = reference_states(splats, seen, P)
         for p, first in enumerate(self._reference):
             for s in range(S):
@@ -185,7 +223,7 @@ class PosePipeline(VanillaPipeline):
                 motion = initial_motion(*pair, p + 1, self.config.seed)
                 M[s, p] = motion.T.cpu()
                 self._known[s, p] = motion.found
-                self._frozen[s, p] = not motion.found or (self.config.snap and motion.still)
+                self._frozen[s, p] = not motion.found or (snap and motion.still)
         return since_state_0(M, self._known)
 
     def _note_unknown(self, known: Tensor) -> None:
@@ -302,6 +340,46 @@ class PosePipeline(VanillaPipeline):
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         return {**super().get_param_groups(), "part_poses": list(self.model.poses.parameters())}
+
+
+def world_record(state: str, part: str, T: Tensor, fit: WorldFit) -> dict[str, Any]:
+    """What report.json says of a state's world, T [4, 4] its similarity to that of state 0, in the capture's unit."""
+    turn, scale = fit.covariance.diagonal()[3:6].sum().sqrt(), fit.covariance[6, 6].sqrt()
+    return {
+        "state": state,
+        "part": part,
+        "T_world_state": T.tolist(),
+        "scale": float(scale_of(T)),
+        "scale_deviation": float(scale_of(T) * scale),
+        "turn_deviation_degrees": math.degrees(float(turn)),
+        "residual_ratio": fit.ratio,
+        "covariance": fit.covariance.tolist(),
+    }
+
+
+def world_sentence(record: dict[str, Any], first: str) -> str:
+    """The same for a person."""
+    R = torch.tensor(record["T_world_state"], dtype=torch.float64)[:3, :3] / record["scale"]
+    turn = math.degrees(float(so3_log(R).norm()))
+    sentence = (
+        f"{record['state']}: its world is brought to that of {first} by the part {record['part']}: scale "
+        f"{record['scale']:.5f} +- {record['scale_deviation']:.5f}, turned by {turn:.2f} "
+        f"+- {record['turn_deviation_degrees']:.2f} deg"
+    )
+    if record["residual_ratio"] > SUSPECT:
+        return f"{sentence}; its images fit badly, check the result, or name another part by --root."
+    return f"{sentence}."
+
+
+def refined_views(capture: Capture, state: int, checkpoint: dict[str, Tensor]) -> list[View]:
+    """The training views of a state with the cameras that its splatart-semantic run ended with."""
+    views, viewmats = load_views(capture, state, "train"), checkpoint.get("_model.viewmats", ())
+    if len(viewmats) != len(views):
+        raise InputError(
+            f"{capture.path}: {capture.states[state].name} has {len(views)} training frames, but its splatart-semantic "
+            f"run has {len(viewmats)}; train it again."
+        )
+    return [replace(view, viewmat=viewmat.float()) for view, viewmat in zip(views, viewmats, strict=True)]
 
 
 def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -15,9 +15,11 @@ from torch import Tensor
 
 from splatart_ns.capture.view import View
 from splatart_ns.errors import InputError
+from splatart_ns.geometry.se3 import inverse
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.rasterize.ssim import l1_ssim_loss
-from splatart_ns.stages.hull import carve
+from splatart_ns.stages.camera_refinement import PASSES, camera_change, refine_cameras
+from splatart_ns.stages.hull import carve, slack
 from splatart_ns.stages.semantic import (
     accumulation_loss,
     ballots,
@@ -26,6 +28,8 @@ from splatart_ns.stages.semantic import (
     trusted,
     vote_logits,
 )
+
+RefineCameras = Literal["auto", "on", "off"]
 
 
 @dataclass
@@ -42,6 +46,8 @@ class SemanticModelConfig(SplatartModelConfig):
     max_gaussians: int = 12000
     """Gaussians are not split or duplicated beyond this number, and 3 / 2 of those that start on the surroundings."""
     background_color: Literal["random", "black", "white"] = "random"
+    refine_cameras: RefineCameras = "off"
+    """Whether the cameras' poses are refined while geometry and colour learn; auto: if no hull fits the images."""
 
 
 class SemanticModel(SplatartModel):
@@ -73,6 +79,13 @@ class SemanticModel(SplatartModel):
         )
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
         self._for_surroundings = 3 * self.kwargs["metadata"].get("points3D_around", 0) // 2
+        # World to camera, OpenCV axes, of the training frames as they were last refined.
+        self.register_buffer("viewmats", torch.eye(4, dtype=torch.float64).repeat(self.num_train_data, 1, 1))
+        self.register_buffer("cameras_refined", torch.tensor(False))
+
+    def load_state_dict(self, state, **kwargs):
+        self.viewmats = torch.zeros_like(state["viewmats"], device=self.device)
+        return super().load_state_dict(state, **kwargs)
 
     @property
     def learns_parts(self) -> bool:
@@ -119,9 +132,9 @@ class SemanticModel(SplatartModel):
             self.strategy.grow_grad2d = max(self.strategy.grow_grad2d, float(need.topk(room + 1).values[-1]))
 
     @torch.no_grad()
-    def fade_outside(self, views: list[View]) -> None:
+    def fade_outside(self, views: list[View], slack: int) -> None:
         """Make Gaussians with their centre outside a silhouette, or seen by no view, transparent: they get pruned."""
-        outside = ~carve(views, self.means.cpu(), dilate=2).to(self.device)
+        outside = ~carve(views, self.means.cpu(), dilate=2 + slack).to(self.device)
         self.gauss_params["opacities"][outside] = -10.0
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
@@ -164,8 +177,22 @@ class SemanticPipeline(VanillaPipeline):
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         self.notes: list[str] = []
-        self._views: list[View] | None = None
         self._labelled: set[int] = set()
+        self.findings: dict[str, Any] = {}
+        self._slack = self.datamanager.slack
+        wanted = self.model.config.refine_cameras
+        self._refines = wanted == "on" or (wanted == "auto" and self._slack > 0)
+        if self._slack > 0 and not self._refines:
+            state = self.datamanager.capture.states[self.datamanager.dataparser.config.state].name
+            self.notes.append(
+                f"{state}: the silhouettes contradict each other by {self._slack} pixels, so cameras or masks are not "
+                "exact; try --refine-cameras auto."
+            )
+        dataset = self.datamanager.train_dataset
+        if self.datamanager.test_mode == "val":
+            self._views = [dataset.get_view(i) for i in range(len(dataset))]
+            self._given = torch.stack([view.viewmat for view in self._views]).double()
+            self.model.viewmats = self._given.to(self.device)
 
     def get_train_loss_dict(self, step: int):
         if self.model.learns_parts:
@@ -190,6 +217,8 @@ class SemanticPipeline(VanillaPipeline):
             )
         callbacks = super().get_training_callbacks(training_callback_attributes)
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+        if self._refines:
+            callbacks.append(TrainingCallback(before, self._refine_cameras))
         callbacks.append(TrainingCallback(before, self._keep_inside))
         callbacks.append(TrainingCallback(before, self._vote))
         return callbacks
@@ -199,20 +228,40 @@ class SemanticPipeline(VanillaPipeline):
         config = self.model.config
         if step % config.refine_every != 0 or not 0 < step <= config.semantic_start:
             return
-        if self._views is None:
-            dataset = self.datamanager.train_dataset
-            self._views = [dataset.get_view(i) for i in range(len(dataset))]
         if all(view.alpha is not None for view in self._views):
-            self.model.fade_outside(self._views)
+            self.model.fade_outside(self._views, self._slack)
+
+    def _refine_cameras(self, step: int) -> None:
+        """Where it is time for it, move the cameras of the training frames."""
+        due = [p for p in PASSES if step == round(p.at * self.model.config.semantic_start)]
+        if not due:
+            return
+        model = self.model
+        model.viewmats = refine_cameras(model.splat.detach(), self._views, self._given, due[-1].pixels)
+        model.cameras_refined = torch.tensor(True, device=self.device)
+        pairs = zip(self._views, model.viewmats.float().cpu(), strict=True)
+        self._views = [replace(view, viewmat=viewmat) for view, viewmat in pairs]
+        poses = inverse(model.viewmats) * torch.tensor([1.0, -1.0, -1.0, 1.0]).to(model.viewmats)
+        cameras = self.datamanager.train_cameras.camera_to_worlds
+        cameras.copy_(poses[:, :3].to(cameras))
+        self._slack = slack(self._views) if self._slack else 0
+        if due[-1] is PASSES[-1]:
+            change = camera_change(model.viewmats, self._given)
+            self.findings["cameras"] = {**asdict(change), "slack_pixels": [self.datamanager.slack, self._slack]}
+            state = self.datamanager.capture.states[self.datamanager.dataparser.config.state].name
+            self.notes.append(
+                f"{state}: the cameras contradicted each other by {self.datamanager.slack} pixels; they were turned by "
+                f"{change.degrees:.2f} deg and moved by {change.percent:.2f} % of their distance, and now do so by "
+                f"{self._slack}."
+            )
 
     def _vote(self, step: int) -> None:
         """Where the second phase begins: which frames' labels to trust, and what they say together."""
         if step < self.model.config.semantic_start or self._labelled:
             return
-        dataset = self.datamanager.train_dataset
-        frames = dataset.metadata["frames"]
+        frames = self.datamanager.train_dataset.metadata["frames"]
         labelled = [i for i, frame in enumerate(frames) if frame.labels is not None]
-        votes = ballots(self.model.splat.detach(), [dataset.get_view(i) for i in labelled], self.model.num_parts)
+        votes = ballots(self.model.splat.detach(), [self._views[i] for i in labelled], self.model.num_parts)
         kept = trusted(votes)
         for i in (labelled[v] for v in (~kept).nonzero()[:, 0].tolist()):
             self.notes.append(f"{frames[i].labels}: contradicts the other frames' labels and is not used.")

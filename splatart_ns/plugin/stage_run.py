@@ -31,7 +31,7 @@ from splatart_ns.plugin.compat import seed_everything, stop_event_writers
 from splatart_ns.rasterize.rasterization import Backend, set_backend
 
 Outcome = dict[str, Any]
-"""What a run took: seconds, iterations, gaussians, peak_memory_mb, and its notes for the user."""
+"""What a run took: seconds, iterations, gaussians, peak_memory_mb; its notes for the user; and what else it found."""
 
 
 def run_stage(config: TrainerConfig, on_step: Callable[[int], None]) -> Outcome:
@@ -52,6 +52,7 @@ def run_stage(config: TrainerConfig, on_step: Callable[[int], None]) -> Outcome:
         "gaussians": trainer.pipeline.model.num_points,
         "peak_memory_mb": _peak_memory_mb(),
         "notes": getattr(trainer.pipeline, "notes", []),
+        **getattr(trainer.pipeline, "findings", {}),
     }
 
 

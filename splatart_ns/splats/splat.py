@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -85,6 +86,10 @@ class Splat:
             quats=quat_multiply(quat_from_matrix(R), self.quats),
             sh=rotate_sh(R, self.sh),
         )
+
+    def scaled(self, factor: float) -> Splat:
+        """Made larger about the origin."""
+        return replace(self, means=factor * self.means, log_scales=self.log_scales + math.log(factor))
 
     @staticmethod
     def cat(splats: Sequence[Splat]) -> Splat:

@@ -12,6 +12,7 @@ from torch import Tensor
 from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import inverse
+from splatart_ns.geometry.similarity import inverse_similarity, view_of_moved
 from splatart_ns.rasterize.rasterization import rasterization, sh_colors
 from splatart_ns.splats.splat import Splat
 
@@ -44,11 +45,8 @@ class PartView:
     factor: int
 
     def render(self, splat: Splat, T: Tensor) -> Tensor:
-        """The splat under motions [K, 4, 4]: [K, H, W, 4], colours over black and accumulation.
-
-        A splat moved by T looks to a camera V as the unmoved one does to V T.
-        """
-        viewmats = self.viewmat @ T.to(self.viewmat)
+        """The splat under motions or similarities [K, 4, 4]: [K, H, W, 4], colours over black and accumulation."""
+        viewmats = view_of_moved(self.viewmat, T.to(self.viewmat))
         height, width = self.weight.shape
         image, accumulation, _ = rasterization(
             splat.means,
@@ -168,9 +166,10 @@ class PartPair:
     def residuals(self, T: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """View by view, the differences [K, H, W, 4] under motions T [K, 4, 4] and the pixels' weights [H, W].
 
-        First the source's Gaussians moved by T in the target's views, then the target's moved back in the source's.
+        First the source's Gaussians moved by T in the target's views, then the target's moved back in the source's. T
+        may be similarities.
         """
-        for splat, views, motion in zip(self.splats, reversed(self.views), (T, inverse(T)), strict=True):
+        for splat, views, motion in zip(self.splats, reversed(self.views), (T, inverse_similarity(T)), strict=True):
             for view in views:
                 yield view.difference(splat, motion, self.chroma_weight), view.weight
 

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from splatart_ns.geometry.se3 import from_rotation_translation, skew, so3_exp, transform_points
 from splatart_ns.stages.part_pair import HUBER, PartPair, huber
 
 STEP = 4e-3
-"""Forward differences: radians, and part radii."""
+"""Forward differences: radians, part radii, and the logarithm of a scale."""
 
 
 @dataclass(frozen=True)
@@ -30,20 +31,25 @@ class Refinement:
 
 
 def increment(T: Tensor, xi: Tensor, centroid: Tensor, radius: float) -> Tensor:
-    """Motions [..., 4, 4] after small ones xi [..., 6]: translation in radii, rotation about the moved centroid."""
+    """Motions [..., 4, 4] after small ones xi [..., 6 or 7]: translation in radii, rotation about the moved centroid,
+    and perhaps the logarithm of a scale about it."""
     pivot = transform_points(T, centroid[None])[..., 0, :]
-    R = so3_exp(xi[..., 3:])
+    R = so3_exp(xi[..., 3:6])
+    if xi.shape[-1] == 7:
+        R = R * xi[..., 6:, None].exp()
     small = from_rotation_translation(R, pivot + radius * xi[..., :3] - (R @ pivot[..., None])[..., 0])
     return small @ T
 
 
-def refine(pair: PartPair, T: Tensor, max_iterations: int = 6, hold_rotation: bool = False) -> Refinement:
+def refine(
+    pair: PartPair, T: Tensor, max_iterations: int = 6, hold_rotation: bool = False, with_scale: bool = False
+) -> Refinement:
     """Levenberg-Marquardt from T [4, 4] on all pixels of the pair, robust by Huber weights.
 
-    `hold_rotation` moves only the translation.
+    `hold_rotation` moves only the translation, `with_scale` lets T become a similarity.
     """
     T = T.double()
-    n = 3 if hold_rotation else 6
+    n = 3 if hold_rotation else 7 if with_scale else 6
     damping, converged = 1e-3, False
     equations = _normal_equations(pair, T, n)
     iteration = 0
@@ -51,7 +57,7 @@ def refine(pair: PartPair, T: Tensor, max_iterations: int = 6, hold_rotation: bo
         iteration += 1
         H = equations.H + damping * equations.H.diagonal().clamp_min(1e-12).diag()
         step = -torch.linalg.solve(H, equations.g.sum(0))
-        trial = increment(T, torch.nn.functional.pad(step, (0, 6 - n)), pair.centroid, pair.radius)
+        trial = increment(T, pad(step, (0, max(0, 6 - n))), pair.centroid, pair.radius)
         cost = float(pair.cost(trial[None])[0])
         if cost < equations.cost:
             converged = bool(step.abs().max() < 0.1 * STEP) or cost > (1 - 1e-4) * equations.cost
@@ -91,7 +97,7 @@ def linearized(difference: Tensor, weight: Tensor, step: float) -> tuple[Tensor,
 
 @torch.no_grad()
 def _normal_equations(pair: PartPair, T: Tensor, n: int) -> NormalEquations:
-    steps = torch.nn.functional.pad(STEP * torch.eye(n, dtype=T.dtype, device=T.device), (0, 6 - n, 1, 0))
+    steps = pad(STEP * torch.eye(n, dtype=T.dtype, device=T.device), (0, max(0, 6 - n), 1, 0))
     motions = increment(T.expand(n + 1, 4, 4), steps, pair.centroid, pair.radius)
     H, gradients, costs = zip(*(linearized(d, w, STEP) for d, w in pair.residuals(motions)), strict=True)
     return NormalEquations(sum(H), torch.stack(gradients), sum(costs) / max(pair.area, 1.0))
@@ -99,6 +105,8 @@ def _normal_equations(pair: PartPair, T: Tensor, n: int) -> NormalEquations:
 
 def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | None = None) -> Tensor:
     """How uncertain a refined motion T [4, 4] is [6, 6] float64; `equations`: those of its `Refinement`, if it has one.
+
+    [7, 7] for a similarity, whose equations have a scale: its logarithm comes last.
 
     The tangent is (translation, rotation) of a left increment in the world frame: T = se3_exp(xi) T_true, so that the
     translation is that of the world's origin. A sandwich estimate with views as clusters (Liang and Zeger 1986):
@@ -111,15 +119,18 @@ def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | No
     equations = equations or _normal_equations(pair, T, 6)
     # Mean squared residual of one of the 4 channels; a perfect fit has none.
     variance = max(equations.cost / 2, 1e-9)
-    V = len(equations.g)
+    V, n = equations.g.shape
     g = equations.g - equations.g.mean(0)
     directions = torch.stack([d.sum(0) for d in g.split([len(pair.views[1]), len(pair.views[0])])])
-    H_inv = torch.linalg.inv(equations.H + variance / math.pi**2 * torch.eye(6).to(T))
-    local = H_inv @ (V / max(V - 6, 1) * g.T @ g + directions.T @ directions) @ H_inv + variance * H_inv
+    H_inv = torch.linalg.inv(equations.H + variance / math.pi**2 * torch.eye(n).to(T))
+    local = H_inv @ (V / max(V - n, 1) * g.T @ g + directions.T @ directions) @ H_inv + variance * H_inv
     # From (radii, radians) about the moved centroid to the world's origin.
-    A = torch.eye(6, dtype=T.dtype, device=T.device)
+    pivot = transform_points(T, pair.centroid[None])[0]
+    A = torch.eye(n, dtype=T.dtype, device=T.device)
     A[:3, :3] *= pair.radius
-    A[:3, 3:] = skew(transform_points(T, pair.centroid[None])[0])
+    A[:3, 3:6] = skew(pivot)
+    if n == 7:
+        A[:3, 6] = -pivot
     return A @ local @ A.T
 
 

@@ -3,8 +3,9 @@ from dataclasses import replace
 import torch
 from part_scene import box, photograph
 
+from splatart_ns.geometry.se3 import se3_exp
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.hull import MIN_POINTS_PER_PART, carve, seed_points, visual_hull, vote_by_projection
+from splatart_ns.stages.hull import MIN_POINTS_PER_PART, carve, seed_points, slack, visual_hull, vote_by_projection
 
 SIZE = (0.9, 0.6, 0.3)
 BASE, KNOB = box(1, SIZE, (0.0, 0.0, -0.1)), box(2, (0.16, 0.16, 0.16), (0.0, 0.0, 0.3), spacing=0.04)
@@ -68,3 +69,15 @@ def test_no_silhouette_gives_no_points():
     for view in empty:
         view.alpha = torch.zeros_like(view.alpha)
     assert seed_points(empty, 2, 100, torch.Generator().manual_seed(0)) is None
+
+
+def test_silhouettes_of_wrong_cameras_have_slack():
+    splat = box(1, (0.8, 0.12, 0.12), (0.0, 0.0, 0.0))
+    views = photograph(splat, 12)
+    assert slack(views) == 0
+    g = torch.Generator().manual_seed(0)
+    wrong = [replace(v, viewmat=se3_exp(0.02 * torch.randn(6, generator=g)) @ v.viewmat) for v in views]
+    pixels = slack(wrong)
+    assert pixels > 0
+    few, many = visual_hull(wrong), visual_hull(wrong, slack=pixels)
+    assert few is None or len(few[0]) < len(many[0])

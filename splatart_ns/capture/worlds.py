@@ -1,0 +1,46 @@
+"""States that were captured separately, each in a world of its own, put into one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from splatart_ns.capture.capture import Capture, State, Worlds
+
+
+def in_one_world(capture: Capture, T: np.ndarray | Sequence[Sequence[Sequence[float]]]) -> Capture:
+    """The capture with the similarities T [S, 4, 4] applied to its states: state k's world to that of state 0.
+
+    It keeps the normalisation of state 0 alone.
+    """
+    states = tuple(_placed(state, Tk) for state, Tk in zip(capture.states, np.asarray(T, dtype=float), strict=True))
+    return replace(capture, states=states, normalization=states[0].normalization())
+
+
+def focus_on_focus(capture: Capture, worlds: Worlds) -> Capture:
+    """The capture, whose worlds differ so, with its states side by side: where the cameras of each look is one place.
+
+    For "similar" they look from as far, too. How states are turned to each other, only their images tell.
+    """
+    if worlds == "shared":
+        return replace(capture, worlds=worlds)
+    own = [state.normalization() for state in capture.states]
+    T = np.tile(np.eye(4), (len(own), 1, 1))
+    for Tk, normalization in zip(T, own, strict=True):
+        scale = normalization.scale / own[0].scale if worlds == "similar" else 1.0
+        Tk[:3, :3] *= scale
+        Tk[:3, 3] = own[0].centre - scale * normalization.centre
+    T[0] = np.eye(4)
+    return replace(in_one_world(capture, T), worlds=worlds)
+
+
+def _placed(state: State, T: np.ndarray) -> State:
+    scale = np.cbrt(np.linalg.det(T[:3, :3]))
+    frames = []
+    for frame in state.frames:
+        pose = T @ frame.T_world_camera
+        pose[:3, :3] /= scale
+        frames.append(replace(frame, T_world_camera=pose))
+    return replace(state, frames=tuple(frames), placement=T @ state.placement)

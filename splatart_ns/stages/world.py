@@ -1,0 +1,117 @@
+"""States that were captured separately: the similarity that brings a state's world to that of state 0, by a part."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from splatart_ns.capture.view import View
+from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_of, similarity, view_of_moved
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.part_pair import part_pair
+from splatart_ns.stages.pose_evidence import ALL_VIEWS, MAX_ITERATIONS
+from splatart_ns.stages.refinement import motion_covariance, refine
+from splatart_ns.stages.registration import MIN_POINTS, part_points
+from splatart_ns.stages.render_choice import COARSE_PIXELS, FINE_PIXELS, SUSPECT, VIEWS, initial_motion
+
+
+@dataclass(frozen=True)
+class WorldFit:
+    """How a state's world lies in that of state 0."""
+
+    T: Tensor
+    """The similarity [4, 4] float64 that brings the state's world to that of state 0."""
+    covariance: Tensor
+    """[7, 7] float64 of its inverse, about the origin: translation, rotation, logarithm of the scale (0 where it was
+    given); see `motion_covariance`."""
+    ratio: float
+    """How much worse the part's images fit than with each state's own Gaussians."""
+
+
+def fit_world(
+    splats: tuple[Splat, Splat],
+    views: tuple[Sequence[View], Sequence[View]],
+    seen: tuple[Tensor, Tensor],
+    part: int,
+    with_scale: bool,
+    seed: int = 0,
+) -> WorldFit | None:
+    """The similarity, or the rigid motion, of another state's world to that of state 0 under which `part` rests.
+
+    Many-start registration chosen by rendering, after the part is given the radius that it has in state 0, and then
+    Gauss-Newton on images for all seven unknowns. None where the images show too little of the part.
+
+    Args:
+        splats: The labelled splats of state 0 and of the other state, each in its own world.
+        views: Their training views.
+        seen: The `visibility` of each state's Gaussians.
+    """
+    points = [part_points(s, v, part) for s, v in zip(splats, seen, strict=True)]
+    if min(len(p.xyz) for p in points) < MIN_POINTS:
+        return None
+    factor = points[0].radius / points[1].radius if with_scale else 1.0
+    zoomed = similarity(factor, torch.eye(3), torch.zeros(3))
+    pair_splats = splats[0], splats[1].scaled(factor)
+    pair_views = views[0], moved_views(views[1], zoomed)
+    start = initial_motion(pair_splats, pair_views, seen, part, seed)
+    coarse = part_pair(pair_splats, pair_views, part, VIEWS, COARSE_PIXELS)
+    fine = part_pair(pair_splats, pair_views, part, ALL_VIEWS, FINE_PIXELS)
+    if not start.found or coarse is None or fine is None:
+        return None
+    T = refine(coarse, start.T, MAX_ITERATIONS, with_scale=with_scale).T
+    found = refine(fine, T, 2 * MAX_ITERATIONS, with_scale=with_scale)
+    covariance = torch.zeros(7, 7, dtype=torch.float64, device=T.device)
+    n = len(found.equations.H)
+    covariance[:n, :n] = motion_covariance(fine, found.T, found.equations)
+    ratio = found.cost / max(fine.own_cost(), 1e-12)
+    return WorldFit(inverse_similarity(found.T) @ zoomed.to(found.T), covariance, ratio)
+
+
+def anchors(splats: Sequence[Splat], seen: Sequence[Tensor], num_parts: int) -> list[int]:
+    """The parts 1..P by how much of them the state that shows least of them shows, most first."""
+    amount = torch.stack(
+        [
+            torch.zeros(num_parts + 1).index_add(0, s.part_ids.cpu(), v.cpu().float())[1:]
+            for s, v in zip(splats, seen, strict=True)
+        ]
+    )
+    return [int(p) + 1 for p in amount.amin(0).argsort(descending=True, stable=True)]
+
+
+def fit_worlds(
+    splats: Sequence[Splat],
+    views: Sequence[Sequence[View]],
+    seen: Sequence[Tensor],
+    parts: Iterable[int],
+    with_scale: bool,
+    seed: int = 0,
+) -> tuple[int, list[WorldFit]] | None:
+    """The first of `parts` that fits well in all states, or else that which fits best, and every state's `fit_world` by
+    it but state 0's; None where no part is seen in all states."""
+    best: tuple[int, list[WorldFit]] | None = None
+    for part in parts:
+        fits = []
+        for s in range(1, len(splats)):
+            pair = [(everything[0], everything[s]) for everything in (splats, views, seen)]
+            fits.append(fit_world(*pair, part, with_scale, seed))
+        if None in fits:
+            continue
+        if best is None or max(f.ratio for f in fits) < max(f.ratio for f in best[1]):
+            best = part, fits
+        if max(f.ratio for f in best[1]) < SUSPECT:
+            break
+    return best
+
+
+def moved_views(views: Sequence[View], T: Tensor) -> list[View]:
+    """The views after the similarity T [4, 4] of their world."""
+    back = inverse_similarity(T.double())
+    return [replace(v, viewmat=view_of_moved(v.viewmat.double(), back.to(v.viewmat.device)).float()) for v in views]
+
+
+def moved_splat(splat: Splat, T: Tensor) -> Splat:
+    """The splat after a similarity T [4, 4]."""
+    return splat.scaled(float(scale_of(T))).transformed(rigid_of(T))

@@ -1,0 +1,77 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from part_scene import box, photograph
+
+from splatart_ns.geometry.se3 import inverse, se3_exp
+from splatart_ns.geometry.similarity import similarity
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.camera_refinement import camera_change, refine_cameras
+from splatart_ns.stages.world import moved_views
+
+
+@pytest.fixture(scope="module")
+def scene():
+    splat = Splat.cat([box(1, (0.9, 0.6, 0.3), (0.0, 0.0, -0.3)), box(2, (0.7, 0.4, 0.12), (0.1, 0.0, 0.2))])
+    return splat, photograph(splat)
+
+
+def viewmats(views):
+    return torch.stack([view.viewmat for view in views]).double()
+
+
+def jittered(views, size):
+    """The views with cameras turned by about so many radians, and moved by as much of their distance."""
+    g = torch.Generator().manual_seed(0)
+    out = []
+    for view in views:
+        xi = size * torch.randn(6, generator=g) * torch.tensor([4.0, 4, 4, 1, 1, 1])
+        out.append(replace(view, viewmat=(se3_exp(xi) @ view.viewmat)))
+    return out
+
+
+def test_cameras_come_nearer_to_the_truth(scene):
+    splat, views = scene
+    wrong = jittered(views, 0.01)
+    given = viewmats(wrong)
+    found = wrong
+    for _ in range(4):
+        refined = refine_cameras(splat, found, given, 5000)
+        found = [replace(v, viewmat=m.float()) for v, m in zip(found, refined, strict=True)]
+    # Seen from the object, where the camera's own turns and shifts that cancel do not count.
+    before, after = (seen_shift(splat, x, viewmats(views)) for x in (given, refined))
+    assert before > 0.03
+    assert after < 0.5 * before
+
+
+def seen_shift(splat, found, true):
+    """Root mean square distance of points in the cameras' frames from where they should be, less what all share."""
+    points = torch.cat([splat.means.double(), torch.ones(len(splat), 1)], 1)
+    there = torch.stack([(inverse(t) @ f @ points.T)[:3] for f, t in zip(found, true, strict=True)])
+    return float((there - there.mean(0)).square().sum(1).mean().sqrt())
+
+
+def test_what_all_cameras_have_in_common_stays(scene):
+    splat, views = scene
+    shift = similarity(1.02, se3_exp(torch.tensor([0, 0, 0, 0.02, 0, 0.01]))[:3, :3], torch.tensor([0.03, 0.0, 0.02]))
+    moved = moved_views(views, shift)
+    refined = refine_cameras(splat, moved, viewmats(moved), 500)
+    change = camera_change(refined, viewmats(moved))
+    assert change.degrees < 0.5 and change.percent < 1  # of 1.3 degrees and 2 percent
+
+
+def test_views_without_a_silhouette_stay(scene):
+    splat, views = scene
+    wrong = [replace(v, alpha=None) if k == 3 else v for k, v in enumerate(jittered(views, 0.01))]
+    refined = refine_cameras(splat, wrong, viewmats(wrong), 500)
+    assert torch.equal(refined[3], viewmats(wrong)[3])
+    assert not torch.equal(refined[2], viewmats(wrong)[2])
+
+
+def test_cameras_do_not_go_far_along_what_images_hardly_tell(scene):
+    splat, views = scene
+    wrong = jittered(views, 0.01)
+    refined = refine_cameras(splat, wrong, viewmats(wrong), 500)
+    error, change = camera_change(viewmats(wrong), viewmats(views)), camera_change(refined, viewmats(wrong))
+    assert change.degrees < 1.5 * error.degrees and change.percent < 1.5 * error.percent

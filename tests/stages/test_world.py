@@ -1,0 +1,41 @@
+import pytest
+import torch
+from part_scene import NUM_PARTS, angle_deg, motion, two_states
+
+from splatart_ns.geometry.se3 import transform_points
+from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_of, similarity
+from splatart_ns.stages.visibility import visibility
+from splatart_ns.stages.world import anchors, fit_world, fit_worlds, moved_splat, moved_views
+
+TURN = motion((10, 0, 40), (0.3, -0.2, 0.1))
+
+
+def apart(scale):
+    """Both states of the object, the second in a world of its own, and the way there."""
+    splats, views = two_states(TURN)
+    M = motion((100, -60, 40), (0.3, 0.2, -0.2))
+    T = similarity(scale, M[:3, :3], M[:3, 3])
+    return (splats[0], moved_splat(splats[1], T)), (views[0], moved_views(views[1], T)), T
+
+
+@pytest.mark.parametrize(("scale", "with_scale"), [(1.6, True), (1.0, False)])
+def test_a_resting_part_brings_worlds_together(scale, with_scale):
+    splats, views, T = apart(scale)
+    seen = [visibility(s, v) for s, v in zip(splats, views, strict=True)]
+    assert anchors(splats, seen, NUM_PARTS) == [1, 2]
+    part, (found,) = fit_worlds(splats, views, seen, [1, 2], with_scale)
+    there = inverse_similarity(T)
+    assert part == 1
+    assert float(scale_of(found.T @ T)) == pytest.approx(1, abs=2e-3 if with_scale else 1e-12)
+    assert angle_deg(rigid_of(found.T), rigid_of(there)) < 0.5  # an eighth of a pixel
+    assert float(found.covariance[6, 6].sqrt()) < 5e-3 and (float(found.covariance[6, 6]) > 0) == with_scale
+    corners = transform_points(T, torch.tensor([[0.45, 0.3, -0.3], [-0.45, -0.3, -0.15]]).double())
+    assert torch.allclose(transform_points(found.T, corners), transform_points(there, corners), atol=3e-3)
+
+
+def test_a_part_that_is_not_seen_brings_nothing_together():
+    splats, views, _ = apart(1.0)
+    hidden = splats[0], splats[1].select(splats[1].part_ids == 1)
+    seen = [visibility(s, v) for s, v in zip(hidden, views, strict=True)]
+    assert fit_world(hidden, views, seen, 2, with_scale=True) is None
+    assert fit_worlds(hidden, views, seen, [2], with_scale=True) is None
