@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -21,8 +20,6 @@ from splatart_ns.bundle.motion_file import read_motions
 from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.view import View, load_views
 from splatart_ns.errors import InputError
-from splatart_ns.geometry.se3 import so3_log
-from splatart_ns.geometry.similarity import scale_of
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_config
 from splatart_ns.plugin.gaussians import gauss_params_from_splat, splat_from_state
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
@@ -31,11 +28,11 @@ from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
-from splatart_ns.stages.render_choice import SUSPECT, initial_motion
+from splatart_ns.stages.render_choice import initial_motion
 from splatart_ns.stages.semantic import ballots, trusted
 from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
 from splatart_ns.stages.visibility import visibility
-from splatart_ns.stages.world import WorldFit, anchors, fit_worlds, moved_splat, moved_views
+from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_views, world_record, world_sentence
 
 
 @dataclass
@@ -340,35 +337,6 @@ class PosePipeline(VanillaPipeline):
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         return {**super().get_param_groups(), "part_poses": list(self.model.poses.parameters())}
-
-
-def world_record(state: str, part: str, T: Tensor, fit: WorldFit) -> dict[str, Any]:
-    """What report.json says of a state's world, T [4, 4] its similarity to that of state 0, in the capture's unit."""
-    turn, scale = fit.covariance.diagonal()[3:6].sum().sqrt(), fit.covariance[6, 6].sqrt()
-    return {
-        "state": state,
-        "part": part,
-        "T_world_state": T.tolist(),
-        "scale": float(scale_of(T)),
-        "scale_deviation": float(scale_of(T) * scale),
-        "turn_deviation_degrees": math.degrees(float(turn)),
-        "residual_ratio": fit.ratio,
-        "covariance": fit.covariance.tolist(),
-    }
-
-
-def world_sentence(record: dict[str, Any], first: str) -> str:
-    """The same for a person."""
-    R = torch.tensor(record["T_world_state"], dtype=torch.float64)[:3, :3] / record["scale"]
-    turn = math.degrees(float(so3_log(R).norm()))
-    sentence = (
-        f"{record['state']}: its world is brought to that of {first} by the part {record['part']}: scale "
-        f"{record['scale']:.5f} +- {record['scale_deviation']:.5f}, turned by {turn:.2f} "
-        f"+- {record['turn_deviation_degrees']:.2f} deg"
-    )
-    if record["residual_ratio"] > SUSPECT:
-        return f"{sentence}; its images fit badly, check the result, or name another part by --root."
-    return f"{sentence}."
 
 
 def refined_views(capture: Capture, state: int, checkpoint: dict[str, Tensor]) -> list[View]:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from splatart_ns.capture.view import View
+from splatart_ns.geometry.se3 import so3_log
 from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_of, similarity, view_of_moved
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import part_pair
@@ -115,3 +118,32 @@ def moved_views(views: Sequence[View], T: Tensor) -> list[View]:
 def moved_splat(splat: Splat, T: Tensor) -> Splat:
     """The splat after a similarity T [4, 4]."""
     return splat.scaled(float(scale_of(T))).transformed(rigid_of(T))
+
+
+def world_record(state: str, part: str, T: Tensor, fit: WorldFit) -> dict[str, Any]:
+    """What report.json says of a state's world, T [4, 4] its similarity to that of state 0, in the capture's unit."""
+    turn, scale = fit.covariance.diagonal()[3:6].sum().sqrt(), fit.covariance[6, 6].sqrt()
+    return {
+        "state": state,
+        "part": part,
+        "T_world_state": T.tolist(),
+        "scale": float(scale_of(T)),
+        "scale_deviation": float(scale_of(T) * scale),
+        "turn_deviation_degrees": math.degrees(float(turn)),
+        "residual_ratio": fit.ratio,
+        "covariance": fit.covariance.tolist(),
+    }
+
+
+def world_sentence(record: dict[str, Any], first: str) -> str:
+    """The same for a person."""
+    R = torch.tensor(record["T_world_state"], dtype=torch.float64)[:3, :3] / record["scale"]
+    turn = math.degrees(float(so3_log(R).norm()))
+    sentence = (
+        f"{record['state']}: its world is brought to that of {first} by the part {record['part']}: scale "
+        f"{record['scale']:.5f} +- {record['scale_deviation']:.5f}, turned by {turn:.2f} "
+        f"+- {record['turn_deviation_degrees']:.2f} deg"
+    )
+    if record["residual_ratio"] > SUSPECT:
+        return f"{sentence}; its images fit badly, check the result, or name another part by --root."
+    return f"{sentence}."
