@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from conftest import FRAMES, SIZE, STATES, pose, write_state
 from label_exports import flat_name, write_coco, write_masks, write_yolo
+from small_capture import FRAMES, SIZE, STATES, pose, write_state
 from test_label_import import without_labels
 
 from splatart_ns.capture.capture import Frame, State

@@ -3,7 +3,7 @@ import json
 
 import numpy as np
 import pytest
-from conftest import SIZE, write_state
+from small_capture import SIZE, write_state
 
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.images import read_labels
