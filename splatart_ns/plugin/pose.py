@@ -31,6 +31,7 @@ from splatart_ns.stages.reference import reference_states, refine_known_poses, s
 from splatart_ns.stages.render_choice import initial_motion
 from splatart_ns.stages.semantic import ballots, trusted
 from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
+from splatart_ns.stages.unseen import may_have_turned
 from splatart_ns.stages.visibility import visibility
 from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_views, world_record, world_sentence
 
@@ -231,6 +232,13 @@ class PosePipeline(VanillaPipeline):
             self.notes.append(f"{part}: the images show too little of it to find its pose; {put}.")
             CONSOLE.log(self.notes[-1])
 
+    def _note_turned(self, covariance: Tensor) -> None:
+        """Say of which parts covariances [S, P, 6, 6] leave the turn open."""
+        for s, p in may_have_turned(covariance).nonzero().tolist():
+            part = f"part {self.model.part_names[p + 1]}, state {s}"
+            self.notes.append(f"{part}: the images do not tell how far it turned about its own axis.")
+            CONSOLE.log(self.notes[-1])
+
     def _poses_from_file(self) -> Tensor:
         if self.config.init_file is None:
             raise InputError("--pipeline.init is file, but no file is given; name one by --pipeline.init-file.")
@@ -325,6 +333,7 @@ class PosePipeline(VanillaPipeline):
         model.poses.commit(T)
         known = model.covariance.isfinite().flatten(2).all(-1)
         self._note_unknown(known)
+        self._note_turned(model.covariance)
         merged = Splat.cat(merge_parts(splats, self.views, T, known))
         params = gauss_params_from_splat(merged)
         for name, parameter in params.items():

@@ -57,6 +57,8 @@ EPSILON = 0.02
 """Default limit of the residual, as a share of the object's bounding radius."""
 PRISMATIC_BELOW = 1.2
 """A joint slides if holding the rotation raises the rendering cost by less than this factor."""
+UNSEEN_ROTATION = math.radians(30)
+"""A turn known no better than this is not seen: the part may have turned by any angle."""
 
 # Parameters of a type besides its values.
 _SHAPE = {"fixed": 0, "prismatic": 2, "revolute": 4, "screw": 5, "cylindrical": 4, "spherical": 3, "free": 0}
@@ -72,7 +74,6 @@ _LEAST_LEVER = 0.005  # of the object's radius
 _UNDETERMINED_AXIS = math.radians(15)
 _UNDETERMINED_ORIGIN = 0.25  # of the object's radius
 _UNKNOWN_ROTATION = math.radians(5)
-_UNSEEN_ROTATION = math.radians(30)
 
 
 @dataclass(frozen=True)
@@ -225,7 +226,7 @@ def fit_joints(
     variances, directions = torch.linalg.eigh(errors[..., 3:, 3:])
     worst_rotation = variances.amax((-2, -1)).sqrt()
     # What a turn that nothing shows amounts to, with the slide that comes with it.
-    unseen = (variances > _UNSEEN_ROTATION**2) / variances
+    unseen = (variances > UNSEEN_ROTATION**2) / variances
     unseen = pad(errors[..., 3:] @ directions @ torch.diag_embed(unseen) @ directions.mT, (3, 0))
 
     # The residual is a mean; it needs no more points than these.
@@ -276,11 +277,12 @@ def _choose(
         allowed = [f for f in fits if f.type != "fixed" and (f.type == "prismatic") == slides]
         best = min(allowed, key=lambda f: f.score, default=best)
     others = sorted((f for f in fits if f is not best), key=lambda f: f.score)
-    unseen_turn = best.type == "prismatic" and rotation_sigma > _UNKNOWN_ROTATION
+    unknown_turn = best.type == "prismatic" and rotation_sigma > _UNKNOWN_ROTATION
+    unseen_turn = best.type in ("fixed", "prismatic") and rotation_sigma > UNSEEN_ROTATION
     close = any(f.score < best.score + _PENALTY for f in others)
     return replace(
         best,
-        ambiguous=render_ratio is None and (close or unseen_turn),
+        ambiguous=unseen_turn or render_ratio is None and (close or unknown_turn),
         alternatives=[{"type": f.type, "residual": f.residual, "score": f.score} for f in others],
         undetermined=_undetermined(best, object_radius, rotation_sigma),
         covariance={name: block.tolist() for name, block in best.covariance.items()},
@@ -296,7 +298,7 @@ def _undetermined(fit: JointFit, object_radius: float, rotation_sigma: float) ->
     notes = []
     if fit.type == "fixed":
         notes.append("The parts did not move relative to each other, so axis, origin and type are undetermined.")
-    if fit.type in ("fixed", "prismatic") and rotation_sigma > _UNSEEN_ROTATION:
+    if fit.type in ("fixed", "prismatic") and rotation_sigma > UNSEEN_ROTATION:
         notes.append("The part looks alike from some sides, so that it may have turned unseen.")
     sigma = {k: math.sqrt(torch.linalg.eigvalsh(C)[-1].clamp_min(0)) for k, C in fit.covariance.items()}
     if sigma.get("axis", 0.0) > _UNDETERMINED_AXIS:
@@ -307,7 +309,7 @@ def _undetermined(fit: JointFit, object_radius: float, rotation_sigma: float) ->
         notes.append(f"The origin is undetermined: its standard deviation is {share:.2g} of the object's radius.")
     if not fit.converged:
         notes.append("The fit did not converge, so its figures and their uncertainty are rough.")
-    if fit.type in ("revolute", "screw") and sigma["values"] > _UNSEEN_ROTATION:
+    if fit.type in ("revolute", "screw") and sigma["values"] > UNSEEN_ROTATION:
         degrees = math.degrees(min(sigma["values"], math.pi))
         notes.append(f"The values are undetermined: their standard deviation is up to {degrees:.0f} degrees.")
     return notes

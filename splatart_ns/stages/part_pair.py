@@ -63,11 +63,13 @@ class PartView:
         )
         return torch.cat([image, accumulation], -1)
 
-    def difference(self, splat: Splat, T: Tensor, chroma_weight: float = RGB_WEIGHT) -> Tensor:
-        """How the splat under motions [K, 4, 4] differs from the part [K, H, W, 4], brightness by `RGB_WEIGHT`."""
+    def difference(
+        self, splat: Splat, T: Tensor, chroma_weight: float = RGB_WEIGHT, brightness_weight: float = RGB_WEIGHT
+    ) -> Tensor:
+        """How the splat under motions [K, 4, 4] differs from the part [K, H, W, 4]."""
         difference = self.render(splat, T) - self.rgba
         brightness = difference[..., :3].mean(-1, keepdim=True)
-        difference[..., :3] = RGB_WEIGHT * brightness + chroma_weight * (difference[..., :3] - brightness)
+        difference[..., :3] = brightness_weight * brightness + chroma_weight * (difference[..., :3] - brightness)
         return difference
 
 
@@ -157,6 +159,7 @@ class PartPair:
     radius: float
     """Root mean square distance of the part's Gaussians from the centroid."""
     chroma_weight: float = RGB_WEIGHT
+    brightness_weight: float = RGB_WEIGHT
 
     @property
     def area(self) -> float:
@@ -171,7 +174,7 @@ class PartPair:
         """
         for splat, views, motion in zip(self.splats, reversed(self.views), (T, inverse_similarity(T)), strict=True):
             for view in views:
-                yield view.difference(splat, motion, self.chroma_weight), view.weight
+                yield view.difference(splat, motion, self.chroma_weight, self.brightness_weight), view.weight
 
     def own_cost(self) -> float:
         """What `cost` would be if each state's Gaussians were looked at in their own state's views."""

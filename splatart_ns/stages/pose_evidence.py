@@ -15,6 +15,7 @@ from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import CHROMA_WEIGHT, part_pair
 from splatart_ns.stages.refinement import motion_covariance, refine, rotation_held_ratio
 from splatart_ns.stages.render_choice import FINE_PIXELS, VIEWS
+from splatart_ns.stages.symmetry import settle_turn
 
 ALL_VIEWS = 60
 """Views of each state that the last refinement looks at, where there are so many."""
@@ -29,7 +30,8 @@ def refine_poses(
     """The last rung of the search for poses: Gauss-Newton on all views, and the certainty that they give.
 
     Few views leave the turn of a round part to chance, and the brightness of a photometric loss misleads it, because
-    light stays in the world while parts turn; silhouettes and hues of all views hold it.
+    light stays in the world while parts turn; silhouettes and hues of all views hold it. A round part's turn about its
+    own axis is settled by trying all of them (`settle_turn`), also where the pose is to stay as it is.
 
     Args:
         splats: One labelled splat per state.
@@ -54,7 +56,11 @@ def refine_poses(
             if not frozen[s, p]:
                 found = refine(pair, T[s, p], MAX_ITERATIONS)
                 T[s, p], equations = found.T, found.equations
-            covariances[s, p] = motion_covariance(pair, T[s, p], equations)
+            turned, untold = settle_turn((splats[0], splats[s]), (views[0], views[s]), p + 1, T[s, p])
+            if not torch.equal(turned, T[s, p]):
+                found = refine(pair, turned, MAX_ITERATIONS)
+                T[s, p], equations = found.T, found.equations
+            covariances[s, p] = motion_covariance(pair, T[s, p], equations) + untold
     return T, covariances
 
 

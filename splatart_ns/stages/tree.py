@@ -38,7 +38,7 @@ from splatart_ns.stages.joint import (
 from splatart_ns.stages.joint_constraint import JointConstraint, required_parents
 from splatart_ns.stages.joint_descent import descend_joint
 from splatart_ns.stages.tree_refinement import refine_tree
-from splatart_ns.stages.unseen import known_states, place_unseen, relative_motion
+from splatart_ns.stages.unseen import known_states, may_have_turned, place_unseen, relative_motion
 
 JointMethod = Literal["screw", "descent"]
 _SEEN_NOISE = 0.3
@@ -86,6 +86,17 @@ def infer_tree(
         raise InputError(f"--joint: part {min(missing)} has no Gaussians to hang; leave it out")
     required = required_parents(constraints, root, {p: f"part {p}" for p in points})
     radius = object_radius(points)
+    known = known_states(motions, covariances)
+    lost = {p for p in points if not known[p][0]}
+    if root is None:
+        free = set(points) - set(required)
+        free = free - lost or free
+        if any(_stood_still(p, motions, covariances) for p in free):
+            free = {p for p in free if covariances is None or not may_have_turned(covariances[p]).any()}
+        root = choose_root({p: points[p] for p in free}, motions, radius, noise)
+    if covariances is not None and _stood_still(root, motions):
+        # If it turned unseen, so did all that hangs on it.
+        covariances = covariances | {root: 0 * covariances[root]}
     if method == "descent":
         joints = descend_pairs(points, motions, radius, epsilon)
     else:
@@ -96,13 +107,8 @@ def infer_tree(
         pair = {p: points[p] for p in (c.parent, c.child)}
         told = _told(c, joints, pair, motions, radius, covariances=covariances, noise=noise, epsilon=epsilon)
         joints = {edge: fit for edge, fit in joints.items() if set(edge) != set(pair)} | told
-    known = known_states(motions, covariances)
     # A part of which nothing tells where it is at state 0 hangs on others, and nothing hangs on it.
-    lost = {p for p in points if not known[p][0]}
     joints = {(a, b): fit for (a, b), fit in joints.items() if a not in lost}
-    if root is None:
-        free = [p for p in points if p not in required]
-        root = choose_root({p: points[p] for p in set(free) - lost or free}, motions, radius, noise)
     contacts = find_contacts(points, motions, {_pair(*edge) for edge, fit in joints.items() if fit.accepted}, known)
     groups = _free_groups(points, motions, joints, contacts, root, radius, required)
     contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups})
@@ -162,7 +168,7 @@ def fit_pairs(
     motions = {p: T.double() for p, T in motions.items()}
     states = known_states(motions, covariances)
     # What stood still is known exactly: all errors of the pair are the other part's, which is then the child.
-    still = {p: bool((motions[p] == torch.eye(4).to(motions[p])).all() and states[p].all()) for p in points}
+    still = {p: bool(states[p].all()) and _stood_still(p, motions, covariances) for p in points}
     # So is what is not known at state 0.
     order = sorted(points, key=lambda p: (not states[p][0], not still[p], p))
     pairs = [(a, b) for k, a in enumerate(order) for b in order[k + 1 :]]
@@ -216,6 +222,12 @@ def _both_ways(
         joints[a, b] = fit
         joints[b, a] = fit.reversed(points[a], inverse(T))
     return joints
+
+
+def _stood_still(part: int, motions: Mapping[int, Tensor], covariances: Mapping[int, Tensor] | None = None) -> bool:
+    """Whether a part did not move at all; if its covariances are given, neither may it have turned unseen."""
+    T = motions[part]
+    return bool((T == torch.eye(4).to(T)).all()) and not (covariances and may_have_turned(covariances[part]).any())
 
 
 def _surface_error(points: Tensor, T: Tensor, noise: float, object_radius: float) -> Tensor:

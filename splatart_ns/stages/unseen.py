@@ -14,6 +14,7 @@ from torch import Tensor
 
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.stages.articulate import KinematicTree
+from splatart_ns.stages.joint import UNSEEN_ROTATION
 
 
 def known_states(motions: Mapping[int, Tensor], covariances: Mapping[int, Tensor] | None) -> dict[int, Tensor]:
@@ -21,6 +22,12 @@ def known_states(motions: Mapping[int, Tensor], covariances: Mapping[int, Tensor
     if covariances is None:
         return {p: torch.ones(len(T), dtype=torch.bool, device=T.device) for p, T in motions.items()}
     return {p: covariances[p].isfinite().flatten(1).all(-1) for p in motions}
+
+
+def may_have_turned(covariances: Tensor) -> Tensor:
+    """Which motions [...], from their covariances [..., 6, 6], are of parts that may have turned by any angle."""
+    rotation = covariances[..., 3:, 3:].double().nan_to_num()
+    return torch.linalg.eigvalsh(rotation)[..., -1] > UNSEEN_ROTATION**2
 
 
 def relative_motion(T_a: Tensor, T_b: Tensor, known_a: Tensor, known_b: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -51,6 +51,40 @@ def box(part: int, size, centre, spacing: float = 0.06, num_parts: int = NUM_PAR
     )
 
 
+def disc(part: int, T: torch.Tensor, size=(0.5, 0.08), mark: bool = False, spacing: float = 0.06) -> Splat:
+    """Grey Gaussians on a disc about z, `size` its radius and half height, moved by T; its light stays in the world.
+
+    A mark is a dark spot near the rim.
+    """
+    radius, half = size
+    angle = torch.arange(0, 2 * math.pi, spacing / radius)
+    up = torch.linspace(-half, half, max(2, round(2 * half / spacing) + 1))
+    side = torch.cartesian_prod(angle, up)
+    normals = torch.stack([side[:, 0].cos(), side[:, 0].sin(), torch.zeros(len(side))], -1)
+    xyz = [torch.cat([radius * normals[:, :2], side[:, 1:]], -1)]
+    normals = [normals]
+    u = torch.arange(-radius, radius + 1e-6, spacing)
+    flat = torch.cartesian_prod(u, u)
+    flat = flat[flat.norm(dim=1) < radius]
+    for z in (-half, half):
+        xyz.append(torch.cat([flat, torch.full((len(flat), 1), z)], -1))
+        normals.append(torch.tensor([0.0, 0.0, math.copysign(1, z)]).expand(len(flat), 3))
+    xyz, normals = torch.cat(xyz), torch.cat(normals)
+    light = (normals @ T[:3, :3].float().mT) @ torch.tensor([0.64, 0.48, 0.6])
+    rgb = (0.5 + 0.15 * light)[:, None].repeat(1, 3)
+    if mark:
+        rgb[(xyz - torch.tensor([0.7 * radius, 0, half])).norm(dim=1) < 0.3 * radius] *= 0.4
+    n = len(xyz)
+    return Splat(
+        means=xyz,
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        log_scales=torch.full((n, 3), math.log(spacing * 0.6)),
+        opacity_logits=torch.full((n,), 3.0),
+        sh=((rgb - 0.5) / 0.28209479)[:, None],
+        part_logits=torch.full((n, NUM_PARTS + 1), -8.0).index_fill(1, torch.tensor([part]), 0.0),
+    ).transformed(T)
+
+
 def cameras(count: int, distance: float = 4.0) -> torch.Tensor:
     """World-to-camera transforms [count, 4, 4] from all around, looking at the origin."""
     mats = []
@@ -102,4 +136,4 @@ def nearby(T: torch.Tensor, size: float, seed: int = 0) -> torch.Tensor:
     return se3_exp(size * torch.randn(6, generator=g, dtype=torch.float64)) @ T
 
 
-__all__ = ["NUM_PARTS", "angle_deg", "box", "inverse", "motion", "nearby", "photograph", "two_states"]
+__all__ = ["NUM_PARTS", "angle_deg", "box", "disc", "inverse", "motion", "nearby", "photograph", "two_states"]
