@@ -183,7 +183,7 @@ def fit_pairs(
     to_parent = adjoint(torch.stack([inverse(motions[a]) for a, _ in pairs]))
     known = torch.stack([errors[a] for a, _ in pairs])
     if covariances is not None:
-        moved = {p: C * (not still[p]) for p, C in covariances.items()}
+        moved = {p: covariances[p] * (not still[p]) for p in points}
         known = known + torch.stack([moved[a] + moved[b] for a, b in pairs]).to(known)
     known = torch.where(known_rel[..., None, None], known, torch.nan)
     fits = fit_joints(

@@ -114,6 +114,16 @@ def test_a_part_is_not_shown_in_a_state_where_its_pose_is_not_known(pose_trainer
     assert len(pipeline.notes) == 1 and pipeline.notes[0].startswith("part lid, state 0: ")
 
 
+def test_a_part_that_may_have_turned_unseen_is_noted(pose_trainer):
+    pipeline = pose_trainer(init="centroids").pipeline
+    covariance = torch.zeros_like(pipeline.model.covariance)
+    covariance[0] = torch.nan  # not known is noted elsewhere
+    covariance[1, 1, 4, 4] = 3.3
+    pipeline._note_turned(covariance)
+    (note,) = pipeline.notes
+    assert note.startswith("part lid, state 1: ") and "about its own axis" in note
+
+
 def test_a_run_that_would_never_merge_is_refused(pose_trainer):
     with pytest.raises(InputError, match="max-num-iterations"):
         pose_trainer(steps=4, pose_steps=4, init="centroids")

@@ -258,6 +258,64 @@ def test_a_part_that_stood_still_lends_its_joint_no_error():
         assert math.degrees(math.asin(float(torch.linalg.vector_norm(fit.axis[:2])))) < 0.01
 
 
+def round_part_and_door(*, disc_is_largest=False):
+    """A stand (1), a disc (2) that may have turned about x unseen, and a door (3) that turns 40 degrees on the stand."""
+    size = 2.0 if disc_is_largest else 0.4
+    points = {
+        1: box((0, 0, 0), (1, 1, 1), 0),
+        2: box((-0.6, 0, 0.2), (0.1, size, size), 1),
+        3: box((0.5, 0.55, 0), (0.9, 0.1, 0.9), 2),
+    }
+    eye = torch.eye(4, dtype=torch.float64)
+    door = from_rotation_translation(eye[:3, :3], 0.5 * Y) @ from_rotation_translation(so3_exp(0.7 * Z), 0 * Z)
+    door = door @ from_rotation_translation(eye[:3, :3], -0.5 * Y)
+    motions = {1: torch.stack([eye, eye]), 2: torch.stack([eye, eye]), 3: torch.stack([eye, door])}
+    known = torch.diag(torch.tensor([1e-6] * 6).double()).repeat(2, 1, 1)
+    twist = torch.cat([torch.linalg.cross(points[2].mean(0), X), X])
+    untold = torch.stack([0 * known[0], math.pi**2 / 3 * twist.outer(twist)])
+    return points, motions, {1: known, 2: known + untold, 3: known}
+
+
+@pytest.mark.parametrize("disc_is_largest", [False, True])
+def test_a_disc_that_may_have_turned_unseen_leaves_root_and_other_joints_alone_and_its_joint_open(disc_is_largest):
+    points, motions, covariances = round_part_and_door(disc_is_largest=disc_is_largest)
+    tree = infer_tree(points, motions, covariances=covariances)
+    plain = infer_tree(points, motions, covariances=covariances | {2: covariances[1]}, root=1)
+    assert tree.root == 1
+    joints, others = ({j.child: j for j in t.joints} for t in (tree, plain))
+    assert {c: j.parent for c, j in joints.items()} == {2: 1, 3: 1} == {c: j.parent for c, j in others.items()}
+    assert joints[3].fit.type == others[3].fit.type == "revolute"
+    assert torch.allclose(joints[3].fit.values, others[3].fit.values)
+    assert not joints[3].fit.ambiguous
+    assert joints[2].fit.type == "fixed" and joints[2].fit.ambiguous
+    assert not others[2].fit.ambiguous
+    assert "revolute" in [other["type"] for other in joints[2].fit.alternatives]
+
+
+def test_a_disc_that_the_user_says_turns_has_values_as_uncertain_as_its_turn():
+    points, motions, covariances = round_part_and_door()
+    told = [JointConstraint(1, 2, "revolute")]
+    tree = infer_tree(points, motions, covariances=covariances, constraints=told)
+    fit = next(j.fit for j in tree.joints if j.child == 2)
+    assert fit.type == "revolute"
+    assert math.degrees(fit.covariance["values"][1][1] ** 0.5) > 60
+    assert torch.isfinite(torch.cat([fit.axis, fit.origin, fit.values])).all()
+
+
+@pytest.mark.parametrize("root", [None, 1])
+def test_a_round_root_that_stood_still_did_not_turn_unseen(root):
+    """A table with a round plain foot and a door on it: if the foot turned, so did the world."""
+    points, motions, covariances = round_part_and_door()
+    points, motions = {1: points[1], 3: points[3]}, {1: motions[1], 3: motions[3]}
+    unseen = torch.zeros(2, 6, 6, dtype=torch.float64)
+    unseen[1, 5, 5] = math.pi**2 / 3
+    tree = infer_tree(points, motions, covariances={1: covariances[1] + unseen, 3: covariances[3]}, root=root)
+    assert tree.root == 1
+    (joint,) = tree.joints
+    assert joint.fit.type == "revolute" and not joint.fit.ambiguous
+    assert float(joint.fit.values[1]) == pytest.approx(0.7, abs=1e-3)
+
+
 def test_parts_that_hang_together_but_on_nothing_else_are_carried_by_a_free_joint():
     """Scissors thrown across the room: how they open is not lost, and that no joint explains the throw is said."""
     points, truth, q = drawers(4)
