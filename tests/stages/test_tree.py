@@ -259,7 +259,7 @@ def test_a_part_that_stood_still_lends_its_joint_no_error():
 
 
 def round_part_and_door(*, disc_is_largest=False):
-    """A stand (1), a disc (2) that may have turned about x unseen, and a door (3) that turns 40 degrees on the stand."""
+    """A stand (1), a disc (2) that may have turned about x unseen, a door (3) that turns on the stand by 40 degrees."""
     size = 2.0 if disc_is_largest else 0.4
     points = {
         1: box((0, 0, 0), (1, 1, 1), 0),
