@@ -33,8 +33,7 @@ method = MethodSpecification(
             datamanager=SplatartDatamanagerConfig(dataparser=SplatartDataParserConfig(), seed_gaussians=8000),
             model=SemanticModelConfig(
                 semantic_start=STEPS,
-                num_downscales=1,  # images of half the size first: a fifth of the seconds less, and as sharp
-                resolution_schedule=4 * STEPS // 10,
+                num_downscales=1,
                 sh_degree_interval=100,
                 warmup_length=300,
                 stop_split_at=700,

@@ -56,10 +56,6 @@ EFFORTS: dict[Quality, Effort] = {
 }
 
 
-LEAST_PIXELS = 64
-"""Stage 1 begins with images of half the size unless these had fewer along a side."""
-
-
 @dataclass(frozen=True)
 class Settings:
     """What decides the result of a fit, besides the capture."""
@@ -227,10 +223,6 @@ def _semantic_config(capture: Capture, state: int, runs: Path, settings: Setting
     config.pipeline.model.semantic_start = effort.steps
     config.pipeline.model.refine_cameras = settings.refine_cameras
     config.pipeline.model.stop_split_at = 7 * effort.steps // 10
-    config.pipeline.model.resolution_schedule = 4 * effort.steps // 10
-    smallest = min(min(frame.camera.width, frame.camera.height) for frame in capture.states[state].frames)
-    if smallest < 2 * LEAST_PIXELS:
-        config.pipeline.model.num_downscales = 0
     config.pipeline.model.max_gaussians = 3 * effort.gaussians // 2
     _set_decay(config, effort.steps)
     config.pipeline.datamanager.seed_gaussians = effort.gaussians
