@@ -186,7 +186,7 @@ class SemanticPipeline(VanillaPipeline):
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         self.notes: list[str] = []
-        self._labelled: set[int] = set()
+        self._has_voted = False
         self.findings: dict[str, Any] = {}
         self._slack = self.datamanager.slack
         wanted = self.model.config.refine_cameras
@@ -198,6 +198,7 @@ class SemanticPipeline(VanillaPipeline):
                 "exact; try --refine-cameras auto."
             )
         dataset = self.datamanager.train_dataset
+        self._labelled = {i for i, frame in enumerate(dataset.metadata["frames"]) if frame.labels is not None}
         if self.datamanager.test_mode == "val":
             self._views = [dataset.get_view(i) for i in range(len(dataset))]
             self._given = torch.stack([view.viewmat for view in self._views]).double()
@@ -266,10 +267,10 @@ class SemanticPipeline(VanillaPipeline):
 
     def _vote(self, step: int) -> None:
         """Where the second phase begins: which frames' labels to trust, and what they say together."""
-        if step < self.model.config.semantic_start or self._labelled:
+        if step < self.model.config.semantic_start or self._has_voted:
             return
-        frames = self.datamanager.train_dataset.metadata["frames"]
-        labelled = [i for i, frame in enumerate(frames) if frame.labels is not None]
+        self._has_voted = True
+        frames, labelled = self.datamanager.train_dataset.metadata["frames"], sorted(self._labelled)
         votes = ballots(self.model.splat.detach(), [self._views[i] for i in labelled], self.model.num_parts)
         kept = trusted(votes)
         for i in (labelled[v] for v in (~kept).nonzero()[:, 0].tolist()):

@@ -121,9 +121,10 @@ def test_frames_without_labels_are_passed_over_when_parts_learn(semantic_trainer
     assert set(drawn) == {i for i, frame in enumerate(frames) if frame.labels is not None}
 
 
-def test_a_capture_without_alpha_trains_from_random_gaussians(semantic_trainer, opaque_capture_dir: Path) -> None:
+def test_a_capture_without_alpha_trains_object_and_surroundings(semantic_trainer, opaque_capture_dir: Path) -> None:
     trainer = semantic_trainer(opaque_capture_dir, steps=60, semantic_start=50)
-    assert trainer.pipeline.model.num_points == trainer.pipeline.model.config.num_random
+    around = trainer.pipeline.datamanager.train_dataset.metadata["points3D_around"]
+    assert trainer.pipeline.model.num_points > around > 0
     before = trainer.pipeline.get_average_eval_image_metrics(0)["psnr"]
     for step in range(60):
         _, losses, _ = iterate(trainer, step)
