@@ -12,12 +12,11 @@ from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.plugin.pose import PoseModelConfig, PosePipelineConfig
 
 DESCENT_STEPS = 200
-MERGE_STEPS = 200
+MERGE_STEPS = 400
 
 
 def _adam(lr: float) -> dict:
-    scheduler = ExponentialDecaySchedulerConfig(lr_final=0.1 * lr, max_steps=MERGE_STEPS)
-    return {"optimizer": FusedAdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": scheduler}
+    return {"optimizer": FusedAdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": None}
 
 
 method = MethodSpecification(

@@ -275,7 +275,7 @@ def test_a_rasterizer_that_cannot_run_is_refused_before_any_work(run_main, hinge
 def test_demo_goes_from_nothing_to_a_film(run_main, monkeypatch, hinge_fit, tmp_path):
     """With the fit itself, which has tests of its own, replaced by a finished one."""
 
-    def fit(capture, output_dir, quality, root, seed, rasterizer, joints):
+    def fit(capture, output_dir, *settings):
         assert (capture / "ground_truth.json").is_file()
         return shutil.copytree(hinge_fit, output_dir, dirs_exist_ok=True)
 

@@ -29,6 +29,8 @@ _WRONG_PART, _WRONG_OBJECT = 0.6, 0.3
 """A frame's labels are wrong where it contradicts the others on so much of a part, or of all parts together, which are
 so many points:"""
 _ENOUGH_POINTS = 30
+_ENOUGH_BALLOTS = 10
+"""With fewer labelled frames the hull is too crude for the stricter limit of all parts together."""
 _MOST_WRONG = 30
 """So many wrong frames are named of each state."""
 _WIDE_BAND, _SHIFTED_BAND = 0.02, 0.02
@@ -257,7 +259,8 @@ def _check_votes(capture: Capture, one: _Evidence) -> Iterator[Problem]:
         ]
         if number.sum() >= _ENOUGH_POINTS:
             whole = float((share * number).sum() / number.sum())
-            known.append((whole / _WRONG_OBJECT, whole, "object"))
+            limit = _WRONG_OBJECT if len(one.votes.ballots) >= _ENOUGH_BALLOTS else _WRONG_PART
+            known.append((whole / limit, whole, "object"))
         return max(known, default=(0.0, 0.0, ""))
 
     for _ in range(min(_MOST_WRONG, len(one.votes.ballots))):

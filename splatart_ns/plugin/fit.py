@@ -50,9 +50,9 @@ class Effort:
 
 
 EFFORTS: dict[Quality, Effort] = {
-    "draft": Effort(gaussians=4000, steps=400, merge_steps=80),
-    "standard": Effort(gaussians=8000, steps=1000, merge_steps=200),
-    "high": Effort(gaussians=16000, steps=3000, merge_steps=600),
+    "draft": Effort(gaussians=4000, steps=400, merge_steps=150),
+    "standard": Effort(gaussians=8000, steps=1000, merge_steps=400),
+    "high": Effort(gaussians=16000, steps=3000, merge_steps=1500),
 }
 
 
@@ -224,7 +224,9 @@ def _semantic_config(capture: Capture, state: int, runs: Path, settings: Setting
     config.pipeline.model.refine_cameras = settings.refine_cameras
     config.pipeline.model.stop_split_at = 7 * effort.steps // 10
     config.pipeline.model.max_gaussians = 3 * effort.gaussians // 2
-    _set_decay(config, effort.steps)
+    for optimizer in config.optimizers.values():
+        if optimizer["scheduler"] is not None:
+            optimizer["scheduler"].max_steps = effort.steps
     config.pipeline.datamanager.seed_gaussians = effort.gaussians
     config.pipeline.datamanager.seed = settings.seed
     return _placed(config, capture, state, runs, capture.states[state].name, settings)
@@ -235,7 +237,6 @@ def _pose_config(capture: Capture, semantic_runs: list[Path], runs: Path, settin
     config.pipeline.semantic_runs = tuple(semantic_runs)
     config.pipeline.seed = settings.seed
     config.max_num_iterations = config.pipeline.model.pose_steps + EFFORTS[settings.quality].merge_steps
-    _set_decay(config, config.max_num_iterations)
     if settings.worlds != "shared":
         config.pipeline.root = settings.root
     return _placed(config, capture, 0, runs, "all", settings)
@@ -271,13 +272,6 @@ def _placed(
     config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
     config.steps_per_save = config.max_num_iterations + 1  # at the end only: a stage is repeated as a whole
     return config
-
-
-def _set_decay(config: TrainerConfig, steps: int) -> None:
-    """Let the rates that fall reach their last value after so many steps."""
-    for optimizer in config.optimizers.values():
-        if optimizer["scheduler"] is not None:
-            optimizer["scheduler"].max_steps = steps
 
 
 def _config_file(config: TrainerConfig) -> Path:

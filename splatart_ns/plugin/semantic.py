@@ -32,8 +32,8 @@ from splatart_ns.stages.semantic import (
 RefineCameras = Literal["auto", "on", "off"]
 HALF_SIZE = 0.4
 """The share of the first phase that sees images of half the size."""
-LEAST_PIXELS = 128
-"""Images with fewer pixels along a side are always seen at their full size."""
+LEAST_PIXELS = 256
+"""Images with fewer pixels along a side are always seen at their full size: at this one it was measured."""
 
 
 @dataclass
