@@ -220,7 +220,7 @@ def test_its_processes_end_with_it(start_driver, captures, log, tmp_path):
 def test_two_batches_at_once_share_the_work(captures, recorder, tmp_path, log):
     entries = captures(*(f"object {number}" for number in range(20)))
     told = [recorder(), recorder()]
-    recipe = StubRecipe(str(tmp_path / "log"), seconds=0.01)
+    recipe = StubRecipe(str(tmp_path / "log"), seconds=0.05)  # longer in all than a process takes to start
     threads = [
         threading.Thread(
             target=run_batch, args=(entries, str(tmp_path / "out"), recipe, ProcessPool(1, 4000, 0), recorded)
