@@ -19,10 +19,10 @@ THREADS = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
 """Environment of every stage, on whatever machine: sums depend on the number of threads."""
 _TASKS_PER_PROCESS = 200
 """Then a fresh process takes over, whatever libraries have piled up in the old one."""
-
-
 _LAST_SECONDS = 5.0
 """For a process to end by itself."""
+_ENVIRONMENT = threading.Lock()
+"""Held while `os.environ` is that of a process to start: pools in several threads share it."""
 
 
 class Death(Exception):
@@ -152,13 +152,14 @@ class _Worker:
         self._words = tempfile.NamedTemporaryFile(prefix="splatart-batch-", suffix=".log")
         self.process = context.Process(target=_serve, args=(other, self._words.name), daemon=True)
         told = THREADS | {"CUDA_VISIBLE_DEVICES": self.gpu}
-        before = {key: os.environ.get(key) for key in told}
-        os.environ.update(told)  # libraries read it when the process imports them
-        try:
-            self.process.start()
-        finally:
-            for key, value in before.items():
-                os.environ.pop(key) if value is None else os.environ.update({key: value})
+        with _ENVIRONMENT:
+            before = {key: os.environ.get(key) for key in told}
+            os.environ.update(told)  # libraries read it when the process imports them
+            try:
+                self.process.start()
+            finally:
+                for key, value in before.items():
+                    os.environ.pop(key) if value is None else os.environ.update({key: value})
         other.close()
         self._tasks_left = _TASKS_PER_PROCESS
 

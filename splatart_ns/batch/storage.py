@@ -85,7 +85,10 @@ class Folder:
                 if entry.is_dir(follow_symlinks=False):
                     folders.append(entry.path)
                 elif not (entry.name.startswith(".") and ".tmp" in entry.name) and entry.is_file():
-                    stat = entry.stat()
+                    try:
+                        stat = entry.stat()
+                    except FileNotFoundError:  # another batch has just removed it
+                        continue
                     relative = os.path.relpath(entry.path, top) if os.sep != "/" else entry.path[len(top) :].lstrip("/")
                     found[relative.replace(os.sep, "/")] = FileInfo(stat.st_size, str(stat.st_mtime_ns))
         return found

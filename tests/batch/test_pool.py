@@ -1,7 +1,9 @@
 """Processes of this machine."""
 
 import os
+import threading
 import time
+from multiprocessing.context import SpawnProcess
 
 import pytest
 
@@ -74,3 +76,27 @@ def test_the_gpus_that_the_user_grants(pool, monkeypatch):
     pool.start("a", Needs(gpu=True), os.getenv, "CUDA_VISIBLE_DEVICES")
     assert results(pool, 1) == {"a": "3"}
     assert pool.fits(Needs())  # its one process takes what needs no GPU, too
+
+
+def test_pools_in_two_threads_start_processes_with_the_right_environment(pool, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    start = SpawnProcess.start
+
+    def slow_start(process):
+        time.sleep(0.2)
+        start(process)
+
+    monkeypatch.setattr(SpawnProcess, "start", slow_start)
+    pools = [pool(1, 1000, 0), pool(1, 1000, 0)]
+
+    def run(number):
+        time.sleep(0.1 * number)
+        pools[number].start(number, Needs(), os.getenv, "OMP_NUM_THREADS")
+
+    threads = [threading.Thread(target=run, args=(number,)) for number in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [results(pool, 1) for pool in pools] == [{0: "1"}, {1: "1"}]
+    assert "OMP_NUM_THREADS" not in os.environ
