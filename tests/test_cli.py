@@ -281,7 +281,8 @@ def test_demo_goes_from_nothing_to_a_film(run_main, monkeypatch, hinge_fit, tmp_
 
     monkeypatch.setattr("splatart_ns.plugin.fit.fit", fit)
     monkeypatch.setattr(
-        "splatart_ns.cli.SynthesisOptions", lambda **_: SynthesisOptions(train_views=3, test_views=1, resolution=16)
+        "splatart_ns.cli.demo.SynthesisOptions",
+        lambda **_: SynthesisOptions(train_views=3, test_views=1, resolution=16),
     )
     code, output, _ = run_main("demo", "--output-dir", tmp_path / "demo")
     assert code == 0

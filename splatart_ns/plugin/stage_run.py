@@ -17,7 +17,7 @@ from contextlib import ExitStack
 from queue import SimpleQueue
 from typing import Any, BinaryIO
 
-# Of both ends of `run_side_by_side`; it is read when torch is imported. See cli.py.
+# Of both ends of `run_side_by_side`; it is read when torch is imported. See splatart_ns/cli.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch

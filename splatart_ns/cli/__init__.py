@@ -1,0 +1,51 @@
+"""Gaussian splats of articulated objects that can be posed: fit them to images, render and evaluate them."""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+
+# A spinning OpenMP pool makes two busy processes on one machine many times slower; it is read when torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import tyro
+
+from splatart_ns.cli.batch import Batch, Shards
+from splatart_ns.cli.bundle import Evaluate, Export, View
+from splatart_ns.cli.capture import Check, Import, Labels, Segment, Synth
+from splatart_ns.cli.demo import Demo
+from splatart_ns.cli.fit import Fit
+from splatart_ns.cli.render import Render
+from splatart_ns.errors import InputError
+
+_COMMANDS = {"fit": Fit, "render": Render, "view": View, "eval": Evaluate, "check": Check, "import": Import}
+_COMMANDS |= {"labels": Labels, "segment": Segment}
+_COMMANDS |= {"batch": Batch, "shards": Shards, "export": Export, "synth": Synth, "demo": Demo}
+
+
+def main() -> None:
+    """Run the command line. A user's mistake gets one sentence and exit code 2."""
+    sys.stdout.reconfigure(errors="backslashreplace")  # file names need not be UTF-8
+    # Nerfstudio's own, which its users cannot mend.
+    warnings.filterwarnings("ignore", category=FutureWarning)
+    warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True")
+    try:
+        tyro.extras.subcommand_cli_from_dict(_COMMANDS, prog="splatart", description=__doc__).run()
+        sys.stdout.flush()
+    except BrokenPipeError:  # as of `splatart check CAPTURE | head`; what is left to print has nowhere to go
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        raise SystemExit(141) from None
+    except InputError as error:
+        message = str(error)
+        print(f"error: {message}" + ("" if message.endswith(".") else "."), file=sys.stderr)
+        raise SystemExit(2) from None
+    except OSError as error:
+        if error.filename is None:
+            raise
+        mend = "check the path, its permissions and the space on the disk"
+        print(f"error: {error.filename}: cannot be read or written ({error.strerror}); {mend}.", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("Interrupted. An unfinished fit or batch goes on when it is started again.", file=sys.stderr)
+        raise SystemExit(130) from None

@@ -1,0 +1,29 @@
+"""What several commands share."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from rich.console import Console
+
+CONSOLE = Console()
+Quality = Literal["draft", "standard", "high"]
+Rasterizer = Literal["auto", "torch", "numba", "gsplat"]
+
+
+def choose_rasterizer(rasterizer: Rasterizer) -> None:
+    """Rasterize with this backend from now on."""
+    import torch
+
+    from splatart_ns.rasterize.rasterization import default_backend, set_backend
+
+    set_backend(rasterizer)
+    if default_backend() == "torch" and device() == "cpu":
+        torch.set_num_threads(1)  # its operations are so small that waking a second thread takes longer
+
+
+def device() -> str:
+    """The torch device to work on."""
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"

@@ -1,0 +1,45 @@
+"""`splatart fit`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from splatart_ns.cli.common import CONSOLE, Quality, Rasterizer, choose_rasterizer
+
+
+@dataclass
+class Fit:
+    """Fit an articulated splat to a capture: all stages, resumed after the last finished one."""
+
+    capture: Annotated[Path, tyro.conf.Positional]
+    """Folder of the capture."""
+    output_dir: Path
+    """Folder of the bundle; created, or continued when it holds an unfinished fit."""
+    quality: Quality = "standard"
+    """draft is fast, high is slow."""
+    root: str | None = None
+    """Name of the part that the others hang on; chosen when not given."""
+    seed: int = 0
+    """Seed of everything random."""
+    joint: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """What you know of a joint, by the parts' names: child:parent, child:parent=revolute (or another type),
+    child:parent=none (there is none) or child:parent=not-revolute."""
+    worlds: Literal["shared", "rigid", "similar"] | None = None
+    """For states that were captured separately: rigid where the device measured lengths, similar where structure from
+    motion gave each its own scale. The states are brought into the world of the first by the part --root, or one that
+    is chosen. By default what the capture says."""
+    refine_cameras: Literal["auto", "on", "off"] = "off"
+    """Whether to correct the cameras' poses; auto does where the silhouettes contradict each other."""
+    rasterizer: Rasterizer = "auto"
+    """auto takes gsplat on CUDA, else numba where it is installed, else torch."""
+
+    def run(self) -> None:
+        choose_rasterizer(self.rasterizer)
+        from splatart_ns.plugin.fit import fit
+
+        how = (self.quality, self.root, self.seed, self.rasterizer, self.joint, self.worlds, self.refine_cameras)
+        CONSOLE.print(f"Bundle: {fit(self.capture, self.output_dir, *how)}")

@@ -1,0 +1,127 @@
+"""`splatart render`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.progress import track
+
+from splatart_ns.cli.common import CONSOLE, Rasterizer, choose_rasterizer
+from splatart_ns.errors import InputError
+
+if TYPE_CHECKING:  # it brings torch
+    from splatart_ns.bundle import ArticulatedSplat
+
+
+@dataclass
+class Render:
+    """Render a bundle in one configuration, in a sweep of each joint, along a trajectory, or as a labelled dataset."""
+
+    bundle: Annotated[Path, tyro.conf.Positional]
+    """Folder that `splatart fit` left."""
+    output: Path
+    """A folder for PNG frames or a dataset, or a .gif or .mp4 file."""
+    configuration: Path | None = None
+    """JSON file of joint values, as the viewer saves it; --set changes single ones."""
+    set: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction] = ()
+    """Joint values, joint=value: radians, or degrees as 30deg, or a length; joints of several freedoms take as many,
+    lengths first: ball=10deg,0,5deg. Joints not named are as in state 0."""
+    sweep: bool = False
+    """Move one joint after the other over its observed range."""
+    trajectory: Path | None = None
+    """CSV file: a header of joint names, and a row of values a frame."""
+    dataset: int | None = None
+    """Write a capture with ground truth: so many images with part labels and depth at random views and configurations.
+    Run it again to go on, or with more to add some."""
+    states: int = 2
+    """Configurations of the dataset, each within the observed ranges; the images are dealt out to them."""
+    views: Literal["sphere", "hemisphere"] = "sphere"
+    """See the object of the dataset from everywhere, or from above only."""
+    seed: int = 0
+    """Seed of the dataset."""
+    channel: Literal["rgb", "depth", "accumulation", "parts"] = "rgb"
+    """What to show."""
+    frames: int = 60
+    """Frames of each joint's sweep."""
+    fps: float = 30.0
+    """Frames per second of a film."""
+    resolution: int = 512
+    """Pixels along each side."""
+    azimuth: float | None = None
+    """Degrees of the camera about z; by default it faces the moving parts."""
+    elevation: float = 25.0
+    """Degrees of the camera above the xy plane."""
+    data: Path | None = None
+    """Folder of the capture, to look through one of its cameras instead."""
+    camera: int = 0
+    """Number of that camera in state 0."""
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Colour behind the object, 0 to 1."""
+    rasterizer: Rasterizer = "auto"
+    """As in `splatart fit`."""
+
+    def run(self) -> None:
+        from splatart_ns.bundle import load
+
+        if self.sweep and self.trajectory is not None:
+            raise InputError("--sweep and --trajectory are both given; choose one.")
+        self._check_numbers()
+        choose_rasterizer(self.rasterizer)
+        splat = load(self.bundle)
+        if self.dataset is not None:
+            self._write_dataset(splat)
+        else:
+            self._write_frames(splat)
+
+    def _check_numbers(self) -> None:
+        wrong = {
+            "frames": ("1 or more", self.frames < 1),
+            "fps": ("a number above 0, at most 1000", not 0 < self.fps <= 1000),
+            "resolution": ("1 or more", self.resolution < 1),
+            "azimuth": ("a finite angle", self.azimuth is not None and not math.isfinite(self.azimuth)),
+            "elevation": ("-90 to 90", not -90 <= self.elevation <= 90),
+            "background": ("three numbers from 0 to 1", not all(0 <= c <= 1 for c in self.background)),
+        }
+        for name, (mend, is_wrong) in wrong.items():
+            if is_wrong:
+                raise InputError(f"--{name} is {getattr(self, name)}; give {mend}.")
+
+    def _write_dataset(self, splat: ArticulatedSplat) -> None:
+        from splatart_ns.bundle.dataset import Dataset, DatasetOptions
+        from splatart_ns.bundle.dataset_capture import write_dataset
+
+        if self.set or self.sweep or not (self.configuration is self.trajectory is self.data is None):
+            rivals = "--configuration, --set, --sweep, --trajectory and --data"
+            raise InputError(f"--dataset chooses what it shows; leave out {rivals}.")
+        samples = Dataset(splat, DatasetOptions(self.states, self.resolution, self.views, self.seed))
+        told = write_dataset(samples, self.output, self.dataset, lambda left: track(left, "Images", console=CONSOLE))
+        if not told:
+            CONSOLE.print("note: no ground_truth.json, which cannot tell screws and joints of several freedoms")
+        CONSOLE.print(f"Capture: {self.output}")
+
+    def _write_frames(self, splat: ArticulatedSplat) -> None:
+        from splatart_ns.bundle import animation, configurations
+        from splatart_ns.bundle import camera as cameras
+        from splatart_ns.capture.formats import load_capture
+
+        bundle, base = splat.bundle, {}
+        if self.configuration is not None:
+            base = configurations.read_configuration(self.configuration, bundle)
+        base |= configurations.parse_settings(sum(self.set, ()), bundle)
+        if self.trajectory is not None:
+            path = [base | q for q in configurations.read_trajectory(self.trajectory, bundle)]
+        else:
+            path = configurations.sweep(bundle, base, self.frames) if self.sweep else [base]
+        if self.data is not None:
+            view = cameras.capture_camera(load_capture(self.data), self.camera)
+        else:
+            degrees = self.azimuth
+            azimuth = cameras.front_azimuth(bundle) + math.radians(40) if degrees is None else math.radians(degrees)
+            sphere, elevation = cameras.bounding_sphere(bundle, path), math.radians(self.elevation)
+            view = cameras.orbit_camera(*sphere, azimuth, elevation, self.resolution, self.resolution)
+        images = animation.render_frames(splat, path, view, self.channel, self.background)
+        CONSOLE.print(f"{animation.write_frames(images, self.output, self.fps)} frames: {self.output}")
