@@ -12,7 +12,7 @@ from precision import Case, Operation
 from torch import Tensor
 
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
-from splatart_ns.stages.joint import JointFit, mean_distance
+from splatart_ns.stages.joint_fit import JointFit, mean_distance
 from splatart_ns.stages.joint_parameters import JOINT_DOFS, joint_motion
 
 ORIGIN, PITCH = (0.4, -0.3, 0.2), 0.15

@@ -27,7 +27,8 @@ from joint_cases import HARD_CASES, TREE_CASES, JointErrors, fit_cases, joint_er
 
 from splatart_ns.evaluation.joints import axis_angle
 from splatart_ns.stages.joint import types_for
-from splatart_ns.stages.tree import descend_pairs, fit_pairs, infer_tree, object_radius
+from splatart_ns.stages.joint_pairs import descend_pairs, fit_pairs
+from splatart_ns.stages.tree import infer_tree, object_radius
 
 CONSOLE = Console(width=170)
 

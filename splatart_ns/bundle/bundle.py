@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.joint import JOINT_DOFS as JOINT_DOFS
+from splatart_ns.stages.joint_parameters import JOINT_DOFS as JOINT_DOFS
 
 
 @dataclass

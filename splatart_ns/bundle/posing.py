@@ -14,7 +14,7 @@ from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
 from splatart_ns.capture.capture import Normalization
 from splatart_ns.errors import InputError
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages import joint as stage
+from splatart_ns.stages import joint_parameters as stage
 
 JointValue = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | Tensor
 """Radians or length: [...] for a joint of one freedom, [..., D] for one of D, in the order of `Joint.values`."""

@@ -28,8 +28,9 @@ from splatart_ns.plugin.gaussians import gauss_params_from_splat, splat_from_sta
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
-from splatart_ns.stages.joint import JOINT_DOFS, JointFit
 from splatart_ns.stages.joint_constraint import parse_constraints
+from splatart_ns.stages.joint_fit import JointFit
+from splatart_ns.stages.joint_parameters import JOINT_DOFS
 from splatart_ns.stages.pose import carry
 from splatart_ns.stages.tree import EPSILON, JointMethod, infer_tree
 from splatart_ns.stages.unseen import known_states, place_unseen

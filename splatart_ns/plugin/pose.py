@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,19 +18,17 @@ from torch import Tensor, nn
 
 from splatart_ns.bundle.motion_file import read_motions
 from splatart_ns.capture.capture import Capture
-from splatart_ns.capture.view import View, load_views
+from splatart_ns.capture.view import View
 from splatart_ns.errors import InputError
-from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_config
-from splatart_ns.plugin.gaussians import gauss_params_from_splat, splat_from_state
+from splatart_ns.plugin.gaussians import gauss_params_from_splat
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
+from splatart_ns.plugin.semantic_run import find_semantic_runs, read_state
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import initial_motion
-from splatart_ns.stages.semantic import ballots, trusted
-from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
 from splatart_ns.stages.unseen import may_have_turned
 from splatart_ns.stages.visibility import visibility
 from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_views, world_record, world_sentence
@@ -138,15 +136,10 @@ class PosePipeline(VanillaPipeline):
             return
         capture = self.datamanager.capture
         runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
-        checkpoints = [read_checkpoint(run) for run in runs]
-        states = [self._load_splat(*pair).to(device) for pair in zip(runs, checkpoints, strict=True)]
-        # The parts are rendered without what surrounds them, so an image must say where the object ends.
-        self.views: list[list[View]] = []
-        for s, (splat, checkpoint) in enumerate(zip(states, checkpoints, strict=True)):
-            views = self._trusted([v.to(device) for v in refined_views(capture, s, checkpoint)], splat)
-            self.views.append([with_silhouette(view) or rendered_silhouette(view, splat) for view in views])
-        self._cameras_refined = any(bool(checkpoint["_model.cameras_refined"]) for checkpoint in checkpoints)
-        splats = [splat.select(splat.part_ids > 0) for splat in states]
+        states = [read_state(capture, s, run, self.model.num_parts, device) for s, run in enumerate(runs)]
+        self.views = [state.views for state in states]
+        self._cameras_refined = any(state.cameras_refined for state in states)
+        splats = [state.splat.select(state.splat.part_ids > 0) for state in states]
         self.model.worlds = torch.from_numpy(np.stack([state.placement for state in capture.states])).to(device)
         if capture.worlds != "shared":
             self._bring_together(splats, capture)
@@ -155,25 +148,6 @@ class PosePipeline(VanillaPipeline):
         self.model.start(splats, self._initial_poses(splats), self._frozen)
         self._pairs = self._shuffled_pairs()
         self._own = self._shuffled_views()
-
-    def _trusted(self, views: list[View], splat: Splat) -> list[View]:
-        """The views of a state, without labels that contradict those of the other views."""
-        labelled = [i for i, view in enumerate(views) if view.labels is not None]
-        kept = trusted(ballots(splat, [views[i] for i in labelled], self.model.num_parts))
-        drop = {i for i, keep in zip(labelled, kept.tolist(), strict=True) if not keep}
-        return [replace(view, labels=None) if i in drop else view for i, view in enumerate(views)]
-
-    def _load_splat(self, run: Path, checkpoint: dict[str, Tensor]) -> Splat:
-        """A state's labelled Gaussians."""
-        splat = splat_from_state(checkpoint)
-        if splat.part_logits.shape[1] != self.model.num_parts + 1:
-            raise InputError(
-                f"{run} was trained with {splat.part_logits.shape[1] - 1} parts and the capture has "
-                f"{self.model.num_parts}; train splatart-semantic again."
-            )
-        if not bool((splat.part_ids > 0).any()):
-            raise InputError(f"{run} learned no parts; train splatart-semantic longer, with labelled frames.")
-        return splat
 
     def _bring_together(self, splats: list[Splat], capture: Capture) -> None:
         """Move splats and views of all states into the world of state 0."""
@@ -346,32 +320,3 @@ class PosePipeline(VanillaPipeline):
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         return {**super().get_param_groups(), "part_poses": list(self.model.poses.parameters())}
-
-
-def refined_views(capture: Capture, state: int, checkpoint: dict[str, Tensor]) -> list[View]:
-    """The training views of a state with the cameras that its splatart-semantic run ended with."""
-    views, viewmats = load_views(capture, state, "train"), checkpoint.get("_model.viewmats", ())
-    if len(viewmats) != len(views):
-        raise InputError(
-            f"{capture.path}: {capture.states[state].name} has {len(views)} training frames, but its splatart-semantic "
-            f"run has {len(viewmats)}; train it again."
-        )
-    return [replace(view, viewmat=viewmat.float()) for view, viewmat in zip(views, viewmats, strict=True)]
-
-
-def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
-    """The config.yml of the latest finished splatart-semantic run of each state under outputs/.
-
-    Raises:
-        InputError: naming a state that has none.
-    """
-    found: dict[int, Path] = {}
-    for config in finished_runs(capture, "splatart-semantic"):
-        found[read_run_config(config)["pipeline"]["datamanager"]["dataparser"]["state"]] = config
-    for state in range(num_states):
-        if state not in found:
-            raise InputError(
-                f"outputs/ holds no finished splatart-semantic run of state {state} of {capture}; run "
-                f"`ns-train splatart-semantic --data {capture} splatart-capture --state {state}` first."
-            )
-    return tuple(found[s] for s in range(num_states))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from splatart_ns.stages.joint import JointFit
+from splatart_ns.stages.joint_fit import JointFit
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp, so3_exp, transform_points
-from splatart_ns.stages.joint import JointFit, joint_motion, mean_distance
+from splatart_ns.stages.joint_fit import JointFit, mean_distance
+from splatart_ns.stages.joint_parameters import joint_motion
 
 
 def descend_joint(

@@ -15,30 +15,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from splatart_ns.errors import InputError
-from splatart_ns.geometry.se3 import adjoint, inverse, transform_points
+from splatart_ns.geometry.se3 import inverse, transform_points
 from splatart_ns.stages.arborescence import cheapest_parents, reached_from
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.contact import Contact, find_contacts
-from splatart_ns.stages.joint import (
-    EPSILON,
-    NOISE,
-    JointFit,
-    fit_joint,
-    fit_joints,
-    free_joint,
-    surface_noise,
-    types_for,
-)
+from splatart_ns.stages.joint import EPSILON, NOISE, fit_joint
 from splatart_ns.stages.joint_constraint import JointConstraint, required_parents
-from splatart_ns.stages.joint_descent import descend_joint
+from splatart_ns.stages.joint_fit import JointFit, free_joint
+from splatart_ns.stages.joint_pairs import descend_pairs, fit_pairs, stood_still, surface_error, told_pair
 from splatart_ns.stages.tree_refinement import refine_tree
-from splatart_ns.stages.unseen import known_states, may_have_turned, place_unseen, relative_motion
+from splatart_ns.stages.unseen import known_states, may_have_turned, place_unseen
 
 JointMethod = Literal["screw", "descent"]
 _SEEN_NOISE = 0.3
@@ -91,10 +83,10 @@ def infer_tree(
     if root is None:
         free = set(points) - set(required)
         free = free - lost or free
-        if any(_stood_still(p, motions, covariances) for p in free):
+        if any(stood_still(p, motions, covariances) for p in free):
             free = {p for p in free if covariances is None or not may_have_turned(covariances[p]).any()}
         root = choose_root({p: points[p] for p in free}, motions, radius, noise)
-    if covariances is not None and _stood_still(root, motions):
+    if covariances is not None and stood_still(root, motions):
         # If it turned unseen, so did all that hangs on it.
         covariances = covariances | {root: 0 * covariances[root]}
     if method == "descent":
@@ -105,7 +97,7 @@ def infer_tree(
         )
     for c in sorted(constraints, key=lambda c: not c.forbidden):
         pair = {p: points[p] for p in (c.parent, c.child)}
-        told = _told(c, joints, pair, motions, radius, covariances=covariances, noise=noise, epsilon=epsilon)
+        told = told_pair(c, joints, pair, motions, radius, covariances=covariances, noise=noise, epsilon=epsilon)
         joints = {edge: fit for edge, fit in joints.items() if set(edge) != set(pair)} | told
     # A part of which nothing tells where it is at state 0 hangs on others, and nothing hangs on it.
     joints = {(a, b): fit for (a, b), fit in joints.items() if a not in lost}
@@ -123,119 +115,11 @@ def infer_tree(
     places, motions, known = place_unseen(tree, motions, known)
     points = {p: transform_points(places[p].to(x), x) for p, x in points.items()}
     for p, x in points.items():
-        errors[p] = _surface_error(x.double(), motions[p].double(), floor, radius)
+        errors[p] = surface_error(x.double(), motions[p].double(), floor, radius)
         if covariances is not None:
             unknown = (10 * radius) ** 2 * torch.eye(6).to(errors[p])
             errors[p] = errors[p] + torch.where(known[p][:, None, None], covariances[p].to(errors[p]), unknown)
     return refine_tree(tree, points, motions, errors)
-
-
-def _told(
-    constraint: JointConstraint,
-    joints: Mapping[tuple[int, int], JointFit],
-    points: dict[int, Tensor],
-    motions: dict[int, Tensor],
-    object_radius: float,
-    **settings: Any,
-) -> dict[tuple[int, int], JointFit]:
-    """The joints, both ways round, of a pair of parts as the user wants them; `settings` as in `fit_pairs`."""
-    kind, pair = constraint.type, (constraint.parent, constraint.child)
-    fits = {edge: joints[edge] for edge in (pair, pair[::-1]) if edge in joints}
-    if constraint.forbidden:
-        if kind is None or not fits:
-            return {}
-        types = [t for t in types_for(len(motions[pair[0]])) if t != kind]
-        return fit_pairs(points, motions, object_radius, types=types, **settings) if fits[pair].type == kind else fits
-    if kind == "free" or kind is None and not fits[pair].accepted:
-        fits = {(a, b): free_joint(inverse(motions[a].double()) @ motions[b].double(), points[b]) for a, b in fits}
-    elif kind is not None:
-        fits = fit_pairs(points, motions, object_radius, types=[kind], **settings)
-    return {edge: replace(fit, accepted=True) for edge, fit in fits.items()}
-
-
-def fit_pairs(
-    points: dict[int, Tensor],
-    motions: dict[int, Tensor],
-    object_radius: float,
-    *,
-    covariances: dict[int, Tensor] | None = None,
-    render_ratios: dict[tuple[int, int], float] | None = None,
-    noise: float = NOISE,
-    epsilon: float = EPSILON,
-    types: Sequence[str] | None = None,
-) -> dict[tuple[int, int], JointFit]:
-    """Joints of all pairs by (parent, child), both ways round; arguments as in `infer_tree` and `fit_joint`."""
-    motions = {p: T.double() for p, T in motions.items()}
-    states = known_states(motions, covariances)
-    # What stood still is known exactly: all errors of the pair are the other part's, which is then the child.
-    still = {p: bool(states[p].all()) and _stood_still(p, motions, covariances) for p in points}
-    # So is what is not known at state 0.
-    order = sorted(points, key=lambda p: (not states[p][0], not still[p], p))
-    pairs = [(a, b) for k, a in enumerate(order) for b in order[k + 1 :]]
-    if not pairs:
-        return {}
-    ratios = render_ratios or {}
-    # The parent's error reaches the child by its lever arm; the child's own is added by `fit_joints`.
-    errors = {p: _surface_error(points[p].double(), motions[p], noise, object_radius) for p in points}
-    errors |= {p: torch.zeros_like(errors[p]) for p in points if still[p]}
-    relative = [relative_motion(motions[a], motions[b], states[a], states[b]) for a, b in pairs]
-    T_rel, places, known_rel = (torch.stack(of_pairs) for of_pairs in zip(*relative, strict=True))
-    to_parent = adjoint(torch.stack([inverse(motions[a]) for a, _ in pairs]))
-    known = torch.stack([errors[a] for a, _ in pairs])
-    if covariances is not None:
-        moved = {p: covariances[p] * (not still[p]) for p in points}
-        known = known + torch.stack([moved[a] + moved[b] for a, b in pairs]).to(known)
-    known = torch.where(known_rel[..., None, None], known, torch.nan)
-    fits = fit_joints(
-        T_rel,
-        [transform_points(place, points[b].to(place)) for (_, b), place in zip(pairs, places, strict=True)],
-        object_radius,
-        to_parent @ known @ to_parent.mT,
-        noise,
-        epsilon,
-        [ratios.get((a, b), ratios.get((b, a))) for a, b in pairs],
-        types,
-    )
-    return _both_ways(pairs, fits, T_rel, points)
-
-
-def descend_pairs(
-    points: dict[int, Tensor], motions: dict[int, Tensor], object_radius: float, epsilon: float = EPSILON
-) -> dict[tuple[int, int], JointFit]:
-    """As `fit_pairs`, in the paper's way: of a revolute and a prismatic joint by gradient descent, the better one."""
-    pairs = [(a, b) for a in sorted(points) for b in sorted(points) if a < b]
-    T_rel = [inverse(motions[a].double()) @ motions[b].double() for a, b in pairs]
-    fits = []
-    for (_, b), T in zip(pairs, T_rel, strict=True):
-        both = [descend_joint(kind, T, points[b]) for kind in ("revolute", "prismatic")]
-        best = min(both, key=lambda fit: fit.residual)
-        fits.append(replace(best, accepted=best.residual <= epsilon * object_radius))
-    return _both_ways(pairs, fits, T_rel, points)
-
-
-def _both_ways(
-    pairs: list[tuple[int, int]], fits: Sequence[JointFit], T_rel: Sequence[Tensor], points: dict[int, Tensor]
-) -> dict[tuple[int, int], JointFit]:
-    """Joints by (parent, child) from those of pairs (a, b) with motions T_rel of b relative to a."""
-    joints = {}
-    for (a, b), fit, T in zip(pairs, fits, T_rel, strict=True):
-        joints[a, b] = fit
-        joints[b, a] = fit.reversed(points[a], inverse(T))
-    return joints
-
-
-def _stood_still(part: int, motions: Mapping[int, Tensor], covariances: Mapping[int, Tensor] | None = None) -> bool:
-    """Whether a part did not move at all; if its covariances are given, neither may it have turned unseen."""
-    T = motions[part]
-    return bool((T == torch.eye(4).to(T)).all()) and not (covariances and may_have_turned(covariances[part]).any())
-
-
-def _surface_error(points: Tensor, T: Tensor, noise: float, object_radius: float) -> Tensor:
-    """The covariances [S, 6, 6] that the noise gives a part's motions, about the world's origin."""
-    about = torch.eye(4).to(T)
-    about[:3, 3] = points.mean(0)
-    to_world = adjoint(T @ about)
-    return to_world @ surface_noise(points, noise, object_radius) @ to_world.mT
 
 
 def choose_root(

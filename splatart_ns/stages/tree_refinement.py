@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, inverse, se3_log
 from splatart_ns.stages.articulate import Joint, KinematicTree
-from splatart_ns.stages.joint import free_joint, inverse_hessian, mean_distance, normal_equations
+from splatart_ns.stages.joint_fit import free_joint, mean_distance
 from splatart_ns.stages.joint_parameters import (
     Joints,
     body_twists,
@@ -26,6 +26,7 @@ from splatart_ns.stages.joint_parameters import (
     moved,
     values_of,
 )
+from splatart_ns.stages.joint_solver import inverse_hessian, normal_equations
 
 _MAX_ITERATIONS = 50
 

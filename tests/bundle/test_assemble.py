@@ -8,7 +8,7 @@ from splatart_ns.bundle.assemble import assemble_bundle
 from splatart_ns.bundle.configurations import movable_joints, sweep
 from splatart_ns.splats import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree
-from splatart_ns.stages.joint import JointFit
+from splatart_ns.stages.joint_fit import JointFit
 
 NAMES = {1: "body", 2: "door", 3: "knob", 4: "cat"}
 Z, X = torch.tensor([0.0, 0, 1]).double(), torch.tensor([1.0, 0, 0]).double()

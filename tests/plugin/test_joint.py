@@ -23,7 +23,7 @@ from splatart_ns.plugin.joint import (
 )
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree
-from splatart_ns.stages.joint import JointFit
+from splatart_ns.stages.joint_fit import JointFit
 
 NORMALIZATION = Normalization(np.array([0.5, -1.0, 2.0]), 4.0)
 DOOR, DRAWER = 0.6, 0.25

@@ -9,7 +9,6 @@ from nerfstudio.engine.trainer import Trainer
 from splatart_ns.capture.check import require_valid
 from splatart_ns.errors import InputError
 from splatart_ns.method_configs.pose import method as pose_method
-from splatart_ns.plugin.pose import find_semantic_runs
 
 
 @pytest.fixture(scope="module")
@@ -127,9 +126,3 @@ def test_a_part_that_may_have_turned_unseen_is_noted(pose_trainer):
 def test_a_run_that_would_never_merge_is_refused(pose_trainer):
     with pytest.raises(InputError, match="max-num-iterations"):
         pose_trainer(steps=4, pose_steps=4, init="centroids")
-
-
-def test_semantic_runs_that_are_not_there_are_named_by_state(capture_dir, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="--state 0"):
-        find_semantic_runs(capture_dir, 2)

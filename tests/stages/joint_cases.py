@@ -16,7 +16,9 @@ from splatart_ns.evaluation.joints import axis_angle, covers, point_to_line
 from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, inverse, se3_exp
 from splatart_ns.stages.articulate import Joint as TreeJoint
 from splatart_ns.stages.articulate import KinematicTree, forward_kinematics
-from splatart_ns.stages.joint import JointFit, fit_joints, joint_motion, surface_noise
+from splatart_ns.stages.joint import fit_joints, surface_noise
+from splatart_ns.stages.joint_fit import JointFit
+from splatart_ns.stages.joint_parameters import joint_motion
 from splatart_ns.stages.tree import object_radius
 
 D = torch.float64

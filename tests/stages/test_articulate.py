@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from splatart_ns.geometry.se3 import se3_exp
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
-from splatart_ns.stages.joint import JointFit
+from splatart_ns.stages.joint_fit import JointFit
 
 
 def joint(parent, child, kind, axis, origin, limits=(0.0, 1.0), pitch=0.0):

@@ -3,7 +3,7 @@ import torch
 
 from splatart_ns.geometry.se3 import from_rotation_translation
 from splatart_ns.stages.contact import find_contacts
-from splatart_ns.stages.joint import joint_motion
+from splatart_ns.stages.joint_parameters import joint_motion
 
 
 def box(low, high, count=1500, seed=0):

@@ -7,7 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, inverse, se3_exp, se3_log
-from splatart_ns.stages.joint import fit_joint, fit_joints, free_joint, joint_motion, surface_noise
+from splatart_ns.stages.joint import fit_joint, fit_joints, surface_noise
+from splatart_ns.stages.joint_fit import free_joint
+from splatart_ns.stages.joint_parameters import joint_motion
 
 seeds = given(seed=st.integers(0, 2**31))
 

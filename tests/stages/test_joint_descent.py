@@ -1,8 +1,9 @@
 import pytest
 import torch
 
-from splatart_ns.stages.joint import fit_joint, joint_motion
+from splatart_ns.stages.joint import fit_joint
 from splatart_ns.stages.joint_descent import descend_joint
+from splatart_ns.stages.joint_parameters import joint_motion
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])

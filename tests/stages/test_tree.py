@@ -9,15 +9,10 @@ from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp
 from splatart_ns.stages.arborescence import cheapest_parents
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.contact import Contact, find_contacts
-from splatart_ns.stages.joint import JointFit
 from splatart_ns.stages.joint_constraint import JointConstraint, parse_constraints
-from splatart_ns.stages.tree import (
-    build_tree,
-    choose_root,
-    fit_pairs,
-    infer_tree,
-    object_radius,
-)
+from splatart_ns.stages.joint_fit import JointFit
+from splatart_ns.stages.joint_pairs import fit_pairs
+from splatart_ns.stages.tree import build_tree, choose_root, infer_tree, object_radius
 
 Z, X, Y = (torch.tensor(v, dtype=torch.float64) for v in ((0, 0, 1.0), (1.0, 0, 0), (0, 1.0, 0)))
 

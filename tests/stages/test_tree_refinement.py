@@ -6,7 +6,8 @@ import torch
 
 from splatart_ns.geometry.se3 import inverse, se3_exp
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
-from splatart_ns.stages.joint import JointFit, fit_joint, free_joint
+from splatart_ns.stages.joint import fit_joint
+from splatart_ns.stages.joint_fit import JointFit, free_joint
 from splatart_ns.stages.tree_refinement import refine_tree
 
 AXES = torch.tensor([[0.0, 0, 1], [0, 1, 0], [1, 0, 0]], dtype=torch.float64)
