@@ -20,7 +20,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 import tyro
-from fit import figures, splatart
+from fit_table import COLUMNS, figures, splatart
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -48,8 +48,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    table = Table("capture", "labelled", "wrong", "named", "s", "axis\ndeg", "turn\ndeg", "slide\n% R", "right",
-                  "PSNR\ndB", "part\nIoU", box=SIMPLE_HEAD, pad_edge=False)  # fmt: skip
+    table = Table("capture", "labelled", "wrong", "named", "s", *COLUMNS, box=SIMPLE_HEAD, pad_edge=False)
     for source in options.captures:
         for count, noisy in [(n, False) for n in options.labelled] + [(n, True) for n in options.noisy]:
             name = f"{source.name}_{count}" + "_noisy" * noisy

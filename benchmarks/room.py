@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import trimesh
 import tyro
-from fit import figures, splatart
+from fit_table import COLUMNS, figures, splatart
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -69,8 +69,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    table = Table("object", "labelled", "s", "axis\ndeg", "turn\ndeg", "slide\n% R", "right", "PSNR\ndB", "part\nIoU",
-                  box=SIMPLE_HEAD, pad_edge=False)  # fmt: skip
+    table = Table("object", "labelled", "s", *COLUMNS, box=SIMPLE_HEAD, pad_edge=False)
     for name in options.objects:
         folder = options.output_dir / f"{name}_{options.frames}"
         if not (folder / "truth/ground_truth.json").exists():
