@@ -73,8 +73,8 @@ class Bundle:
     loops: list[dict[str, Any]] = field(default_factory=list)
     """Loop closures: {"joint": name, "parts": [names around the loop]}."""
     provenance: dict[str, Any] = field(default_factory=dict)
-    """{"version", "seed", "settings"}; and "worlds", where states came in worlds of their own: the similarities
-    [S][4][4] that brought them into the canonical frame."""
+    """{"version", "seed", "settings"}; "cameras": where those of each state were [S][N][3], canonical frame; "worlds",
+    where states came in worlds of their own: the similarities [S][4][4] that brought them into the canonical frame."""
 
     @property
     def part_names(self) -> list[str]:

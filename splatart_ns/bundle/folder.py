@@ -110,6 +110,14 @@ def load_bundle(folder: Path) -> Bundle:
     provenance = top.record("provenance")
     if "worlds" in provenance.fields:
         provenance.similarities("worlds", len(states))
+    if "cameras" in provenance.fields:
+        of_states = provenance.items("cameras")
+        if len(of_states) != len(states):
+            provenance.fail(
+                "cameras", f"has {len(of_states)} entries", f"give one for each of the {len(states)} states"
+            )
+        for points in of_states:
+            provenance.numbers("cameras", points, (len(points) if isinstance(points, list) else 1, 3))
     bundle = Bundle(
         parts=sorted(parts, key=lambda part: part.id),
         joints=joints,

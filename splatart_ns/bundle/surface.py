@@ -21,6 +21,8 @@ from splatart_ns.rasterize import rasterization
 from splatart_ns.splats.splat import Splat
 
 _MIN_OPACITY = 0.02
+_FAINT = 0.1
+"""Gaussians below this opacity are haze in front of surfaces, where there are others."""
 _VIEWS = 48
 _DISTANCE = 5.0
 """From the cameras to the part's centre, in its radii: far enough to see into cavities, near enough for float32."""
@@ -30,6 +32,9 @@ _COARSE_PIXELS = 64
 """Size of the images that find the part's extent."""
 _AGREEING = 3
 """So many views must see through a place for it to be empty: fewer may be wrong."""
+_SAME_SIDE = math.cos(math.radians(20))
+"""A view whose direction differs by less than this from a camera's shows what the camera saw: the views are 25 degrees
+apart."""
 _BAND = 3.0
 """Truncation of the signed distance, voxels."""
 _THICKEN = 0.75
@@ -69,7 +74,9 @@ class _DepthView:
 
 
 @torch.no_grad()
-def part_surface(splat: Splat, *, triangles: int = 20_000, voxels: int = 1_000_000) -> trimesh.Trimesh:
+def part_surface(
+    splat: Splat, cameras: Tensor | None = None, *, triangles: int = 20_000, voxels: int = 1_000_000
+) -> trimesh.Trimesh:
     """A watertight mesh around the Gaussians of one part, in their frame and unit, with a colour per vertex.
 
     The part alone is rendered from all around. Space that several views see through is empty; all else is solid: what
@@ -78,12 +85,14 @@ def part_surface(splat: Splat, *, triangles: int = 20_000, voxels: int = 1_000_0
 
     Args:
         splat: The Gaussians [N].
+        cameras: Where the capture's cameras were [M, 3], M > 0, in the Gaussians' frame, if that is known.
         triangles: Most triangles of the mesh, 100 or more; flat shapes take fewer.
         voxels: Number of voxels of the part's box. What is thinner than a voxel is not resolved.
 
     Returns:
-        The mesh, wound outwards. `metadata["unseen_share"]` is the share of its area that no view looks at: where it
-        was closed.
+        The mesh, wound outwards. `metadata["unseen_share"]` is the share of its area that no view looks at, or none
+        from the side of a camera: where it was closed, or follows the inside of Gaussians that were seen from the
+        other side alone.
 
     Raises:
         InputError: No Gaussian is visible, or they have no extent.
@@ -94,6 +103,8 @@ def part_surface(splat: Splat, *, triangles: int = 20_000, voxels: int = 1_000_0
     splat = splat.select(splat.opacities > _MIN_OPACITY)
     if len(splat) == 0:
         raise InputError("a part has no visible Gaussians, and so no surface: fit the object again")
+    clear = splat.opacities > _FAINT
+    splat = splat.select(clear) if clear.any() else splat
     ends = _ellipsoid_ends(splat)
     centre, half = _box(ends)
     radius = float(half.norm())
@@ -123,9 +134,12 @@ def part_surface(splat: Splat, *, triangles: int = 20_000, voxels: int = 1_000_0
             break
         voxels //= 4
     mesh = _thinned(solid, (_THICKEN - _LEFT_THICK) * voxel)
-    colours, seen = _vertex_colours(views, torch.from_numpy(np.array(mesh.vertices)).float(), 2 * voxel)
+    colours, vertex_seen = _vertex_colours(views, torch.from_numpy(np.array(mesh.vertices)).float(), 2 * voxel)
+    seen = vertex_seen[mesh.faces].any(1)
+    if cameras is not None:
+        seen &= _looked_at(views, F.normalize(cameras.to(centre) - centre, dim=-1), mesh, 2 * voxel)
     mesh.visual.vertex_colors = colours
-    mesh.metadata["unseen_share"] = float(mesh.area_faces[~seen[mesh.faces].any(1)].sum() / mesh.area)
+    mesh.metadata["unseen_share"] = float(mesh.area_faces[~seen].sum() / mesh.area)
     mesh.vertices = mesh.vertices * radius + centre.numpy()
     return mesh
 
@@ -324,6 +338,18 @@ def _thinned(solid: manifold3d.Manifold, depth: float) -> trimesh.Trimesh:
     thin = mesh.copy()
     thin.vertices -= depth * mesh.vertex_normals
     return thin if thin.volume > 0.5 * mesh.volume else mesh
+
+
+def _looked_at(views: list[_DepthView], towards: Tensor, mesh: trimesh.Trimesh, band: float) -> np.ndarray:
+    """Which faces [N] some camera saw, of cameras in the directions `towards` [M, 3] from the centre."""
+    cosines, nearest = (_directions(_VIEWS) @ towards.mT).max(-1)
+    points, normals = (torch.from_numpy(np.array(x)).float() for x in (mesh.triangles_center, mesh.face_normals))
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for view, cosine, side in zip(views, cosines, towards[nearest].float(), strict=True):
+        if cosine > _SAME_SIDE:
+            accumulation, behind, _ = view.sample(points)
+            seen |= (accumulation > 0.5) & (behind.abs() < band) & (normals @ side > 0)
+    return seen.numpy()
 
 
 def _vertex_colours(views: list[_DepthView], points: Tensor, band: float) -> tuple[np.ndarray, np.ndarray]:

@@ -20,6 +20,7 @@ from splatart_ns.bundle.assemble import assemble_bundle
 from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.folder import save_bundle
 from splatart_ns.bundle.sliders import freedoms, slider_range, unit_name
+from splatart_ns.bundle.vantage import vantage_points
 from splatart_ns.capture.capture import Normalization
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import se3_exp, se3_log
@@ -256,6 +257,7 @@ class JointPipeline(VanillaPipeline):
             splat = carry([splat], torch.from_numpy(normalization.motion_to_normal(shift.numpy())), 0, 1)
             world, ids = splat_to_world(splat, normalization), splat.part_ids
         self.model.start(splat, self.tree, motions, normalization)
+        worlds = state["_model.worlds"]
         self.bundle: Bundle = assemble_bundle(
             self.tree,
             {p: world.select(ids == p) for p in capture.parts},
@@ -268,7 +270,8 @@ class JointPipeline(VanillaPipeline):
                 "version": version("splatart-ns"),
                 "seed": config.seed,
                 "settings": config.settings,
-                **({} if capture.worlds == "shared" else {"worlds": state["_model.worlds"].tolist()}),
+                "cameras": vantage_points(capture, worlds.numpy()),
+                **({} if capture.worlds == "shared" else {"worlds": worlds.tolist()}),
             },
         )
 

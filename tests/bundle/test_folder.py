@@ -150,6 +150,9 @@ PART, JOINT = ("parts", 1), ("joints", 1)
         (set_("loops", 0, "joint", value="hinge"), "known are closure"),
         (set_("loops", 0, "parts", value=["base", "nobody"]), "nobody"),
         (set_("provenance", value=3), "provenance"),
+        (set_("provenance", "cameras", value=[[[0.0, 1, 2]]]), "each of the 2 states"),
+        (set_("provenance", "cameras", value=[[[0.0, 1, 2]], [[0.0, 1]]]), "cameras"),
+        (set_("provenance", "cameras", value=[[], 3]), "cameras"),
     ],
     ids=lambda v: getattr(v, "__name__", None),
 )

@@ -121,6 +121,35 @@ def test_a_faint_far_gaussian_changes_nothing():
     assert mesh.volume == pytest.approx(0.24, rel=0.15)
 
 
+def test_haze_in_a_hollow_does_not_fill_it():
+    box = trimesh.creation.box((1, 0.6, 0.4))
+    box.update_faces(box.face_normals[:, 2] < 0.5)
+    x = 2 * torch.rand(600, 3, generator=torch.Generator().manual_seed(0)) - 1
+    haze = few((x * torch.tensor([0.4, 0.2, 0.15])).tolist(), (0.08, 0.08, 0.08), opacity_logit=math.log(0.09 / 0.91))
+    shell = splat_on(box, 5000)
+    clear, hazy = (part_surface(s, voxels=VOXELS) for s in (shell, Splat.cat([shell, haze])))
+    assert hazy.volume == pytest.approx(clear.volume, rel=0.02)
+
+
+def test_a_part_of_haze_alone_still_makes_a_solid():
+    haze = splat_on(trimesh.creation.box((1, 0.6, 0.4)), opacity=0.05)
+    assert_solid(part_surface(haze, voxels=VOXELS))
+
+
+def test_what_no_camera_looked_at_is_told():
+    """A box that was seen from above only: from there one sees the top and, from the sides, most of the sides."""
+    splat = splat_on(trimesh.creation.box((1, 0.6, 0.4)), 5000)
+    ring = torch.tensor([[math.cos(a), math.sin(a), 0.0] for a in torch.arange(0, 2 * math.pi, 0.3)])
+    above = torch.cat([5 * ring + torch.tensor([0, 0, z]) for z in (0.3, 2.0, 8.0)])
+    unseen = {
+        name: part_surface(splat, cameras, voxels=VOXELS).metadata["unseen_share"]
+        for name, cameras in {"not said": None, "around": torch.cat([above, -above]), "above": above}.items()
+    }
+    bottom = 0.6 / (2 * (0.6 + 0.4 + 0.24))
+    assert unseen["not said"] < 0.01 and unseen["around"] < 0.01
+    assert unseen["above"] == pytest.approx(bottom, abs=0.05)
+
+
 @pytest.mark.parametrize(
     "splat",
     [

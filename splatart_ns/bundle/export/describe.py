@@ -23,6 +23,8 @@ LIMIT_MARGIN = 0.05
 """Of the observed range, by which limits are wider at both ends."""
 _SIZES = (0.005, 50.0)
 """Metres, of objects that simulators can be trusted with."""
+_GUESSED = 0.1
+"""A larger share of a part's surface that nobody saw is told."""
 _METRES = {
     **dict.fromkeys(("metre", "meter", "metres", "meters", "m"), 1.0),
     **dict.fromkeys(("centimetre", "centimeter", "centimetres", "centimeters", "cm"), 0.01),
@@ -71,6 +73,8 @@ def describe(
         links[names[part]] = Link(names[part], part, origin, inertia, shape.surface, shape.pieces)
         if shape.surface is None and shapes is not None:
             notes.append(f"Part '{part}' has no surface: written with the least mass and without a mesh.")
+        elif shapes is not None and (share := shapes[part].surface.metadata.get("unseen_share", 0.0)) > _GUESSED:
+            notes.append(f"Part '{part}': no camera looked at {share:.0%} of its surface, whose shape is a guess.")
 
     joint_names, joints = _joints(bundle, names, loose, metres, limit_margin)
     for joint in joints:

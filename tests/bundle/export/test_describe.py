@@ -70,6 +70,16 @@ def test_a_part_without_a_surface_is_a_link_of_least_mass(objects):
     assert "'p1' has no surface" in robot.notes[0]
 
 
+def test_a_surface_that_is_mostly_a_guess_is_noted(objects):
+    bundle = objects.chain(["prismatic"])
+    shapes = objects.shapes(bundle)
+    shapes["p1"].surface.metadata["unseen_share"], shapes["p0"].surface.metadata["unseen_share"] = 0.25, 0.02
+    notes = describe(bundle, shapes, "robot").notes
+    assert [note for note in notes if "camera" in note] == [
+        "Part 'p1': no camera looked at 25% of its surface, whose shape is a guess."
+    ]
+
+
 def test_names_that_clash_stay_apart(objects):
     # The chain of the joint "a" needs names that another joint and a part have.
     joints = [
