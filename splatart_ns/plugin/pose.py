@@ -302,7 +302,7 @@ class PosePipeline(VanillaPipeline):
         model = self.model
         splats = [model.state_splat(s).detach() for s in range(model.num_states)]
         T, model.covariance, model.held_ratio = refine_known_poses(
-            splats, self.views, model.poses.T(), self._frozen, self._reference, self._known
+            splats, self.views, model.poses.T(), self._frozen, self._reference, self._known, self._cameras_refined
         )
         model.poses.commit(T)
         known = model.covariance.isfinite().flatten(2).all(-1)

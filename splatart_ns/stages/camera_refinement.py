@@ -8,20 +8,19 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import inverse, se3_exp, se3_log, transform_points
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import PartView, huber, part_view
-from splatart_ns.stages.refinement import STEP, increment, linearized
+from splatart_ns.stages.refinement import STEP, increment, linearized, trial_steps
 
 TURN, MOVE = math.radians(0.5), 0.005
 """What wrong cameras are usually off by: radians, and shares of their distance."""
-CORRELATED = 300.0
-"""The image counts as so many times fewer pixels: they err together. With 10, cameras went twice too far."""
-ITERATIONS = 3
-"""Of Gauss-Newton a pass: the splat changes with the cameras, so no pass needs to end."""
+CORRELATED_SHIFT, CORRELATED_REST = 100.0, 1000.0
+"""The image counts as so many times fewer pixels, which err together: of where in it the object lies, and of how the
+camera is tilted, rolled and how near it is. All pixels tell the first; what they tell of the rest is small, and a splat
+that wrong cameras have blurred misleads it."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,8 @@ class Pass:
     """How many pixels of the object a view is compared in."""
 
 
-PASSES = (Pass(0.15, 1000), Pass(0.3, 2000), Pass(0.45, 4000), Pass(0.6, 6000), Pass(0.8, 10000))
+PASSES = tuple(Pass(0.1 * k, round(1000 * 10 ** (k / 9))) for k in range(1, 10))
+"""Many short ones: the splat follows the cameras, and they can only come as near as it is sharp."""
 
 
 @torch.no_grad()
@@ -68,40 +68,47 @@ def refine_cameras(splat: Splat, views: Sequence[View], given: Tensor, pixels: i
 
 
 def _refined(splat: Splat, seen: PartView, given: Tensor, centroid: Tensor, radius: float) -> Tensor:
-    """One camera [4, 4] by Gauss-Newton with halved steps on the image, and on how far it is from the `given` one.
+    """One camera [4, 4] after a Gauss-Newton step on the image, and on how far it is from the `given` one.
 
-    A camera that turns and steps aside sees nearly the same: without the second, it goes far along that valley.
+    A camera that turns and steps aside sees nearly the same: without the second, it goes far along that valley. The
+    step is shortened until it helps; if it does not, the camera stays.
     """
-    viewmat = seen.viewmat.double()
+    viewmat, eye = seen.viewmat.double(), torch.eye(4).to(given)
     scale = torch.full((6,), TURN).to(viewmat)
     scale[:3] = MOVE * transform_points(given, centroid[None])[0].norm()
-    steps = pad(STEP * torch.eye(6).to(viewmat), (0, 0, 1, 0))
-    T = torch.eye(4).to(viewmat)
+    precision = _precision().to(viewmat)
 
     def far(motions: Tensor) -> Tensor:
         return se3_log(viewmat @ motions @ inverse(given)) / scale
 
-    def cost_after(T: Tensor) -> float:
-        image = huber(seen.difference(splat, T[None])) * seen.weight[..., None]
-        return float(image.sum()) + 0.5 * prior * float(far(T[None]).square().sum())
+    steps = trial_steps(6, True, viewmat)
+    motions = increment(eye.expand(len(steps), 4, 4), steps, centroid, radius)
+    H, g, cost = linearized(seen.difference(splat, motions), seen.weight, STEP, central=True)
+    noise = 2 * cost / float(seen.weight.sum())
+    r, after, before = far(motions).split([1, 6, 6])
+    r, J = r[0], (after - before) / (2 * STEP)
+    step = -torch.linalg.solve(H + noise * J @ precision @ J.T, g + noise * J @ precision @ r)
+    most = cost + 0.5 * noise * float(r @ precision @ r)
+    for _ in range(3):
+        motion = increment(eye, step, centroid, radius)
+        r = far(motion[None])[0]
+        image = huber(seen.difference(splat, motion[None])) * seen.weight[..., None]
+        if float(image.sum()) + 0.5 * noise * float(r @ precision @ r) < most:
+            return viewmat @ motion
+        step = step / 3
+    return viewmat
 
-    prior = None
-    for _ in range(ITERATIONS):
-        motions = increment(T.expand(7, 4, 4), steps, centroid, radius)
-        H, g, cost = linearized(seen.difference(splat, motions), seen.weight, STEP)
-        prior = prior or CORRELATED * 2 * cost / float(seen.weight.sum())
-        r, J = far(motions)[0], (far(motions)[1:] - far(motions)[:1]) / STEP
-        step = -torch.linalg.solve(H + prior * J @ J.T, g + prior * J @ r)
-        before = cost + 0.5 * prior * float(r @ r)
-        for _ in range(3):
-            trial = increment(T, step, centroid, radius)
-            if cost_after(trial) < before:
-                T = trial
-                break
-            step = step / 3
-        else:
-            break
-    return viewmat @ T
+
+def _precision() -> Tensor:
+    """Of the given cameras [6, 6], against that of one pixel of the image, in units of `MOVE` and `TURN`.
+
+    What shifts the object in the image is the camera's step aside and its turn together.
+    """
+    across = torch.zeros(2, 6)
+    across[0, 0], across[0, 4] = MOVE, TURN
+    across[1, 1], across[1, 3] = MOVE, -TURN
+    shift = across.T @ across / (MOVE**2 + TURN**2)
+    return CORRELATED_SHIFT * shift + CORRELATED_REST * (torch.eye(6) - shift)
 
 
 def _without_drift(viewmats: Tensor, given: Tensor, centroid: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ MAYBE_SLIDING = math.radians(10)
 
 
 def refine_poses(
-    splats: Sequence[Splat], views: Sequence[Sequence[View]], T: Tensor, frozen: Tensor
+    splats: Sequence[Splat], views: Sequence[Sequence[View]], T: Tensor, frozen: Tensor, central: bool = False
 ) -> tuple[Tensor, Tensor]:
     """The last rung of the search for poses: Gauss-Newton on all views, and the certainty that they give.
 
@@ -38,6 +38,7 @@ def refine_poses(
         views: Training views of each state.
         T: Poses [S, P, 4, 4], near the optimum.
         frozen: Which of them stay as they are [S, P] bool.
+        central: See `refine`.
 
     Returns:
         The refined poses, and their covariances [S, P, 6, 6]: T = se3_exp(xi) T_true, xi = (translation, rotation). NaN
@@ -54,11 +55,11 @@ def refine_poses(
                 continue
             pair, equations = replace(pair, chroma_weight=CHROMA_WEIGHT), None
             if not frozen[s, p]:
-                found = refine(pair, T[s, p], MAX_ITERATIONS)
+                found = refine(pair, T[s, p], MAX_ITERATIONS, central=central)
                 T[s, p], equations = found.T, found.equations
             turned, untold = settle_turn((splats[0], splats[s]), (views[0], views[s]), p + 1, T[s, p])
             if not torch.equal(turned, T[s, p]):
-                found = refine(pair, turned, MAX_ITERATIONS)
+                found = refine(pair, turned, MAX_ITERATIONS, central=central)
                 T[s, p], equations = found.T, found.equations
             covariances[s, p] = motion_covariance(pair, T[s, p], equations) + untold
     return T, covariances

@@ -55,6 +55,7 @@ def refine_known_poses(
     frozen: Tensor,
     reference: Sequence[int],
     known: Tensor,
+    central: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`refine_poses` and `rotation_held_ratios` of every part against its reference state.
 
@@ -65,6 +66,7 @@ def refine_known_poses(
         frozen: Which of them stay as they are [S, P] bool.
         reference: Each part's reference state.
         known: Which poses were found [S, P] bool.
+        central: See `refine`.
 
     Returns:
         The refined poses, their covariances [S, P, 6, 6] (NaN where not known), and the ratios [P, P].
@@ -73,7 +75,7 @@ def refine_known_poses(
     M = since_reference(T, reference)
     covariances = torch.full((S, P, 6, 6), torch.nan, dtype=torch.float64, device=T.device)
     for order, parts in _groups(reference, known):
-        refined, certainty = refine_poses(*_chosen(splats, views, order, parts), M[order], frozen[order])
+        refined, certainty = refine_poses(*_chosen(splats, views, order, parts), M[order], frozen[order], central)
         for p in parts:
             M[order, p], covariances[order, p] = refined[:, p], certainty[:, p]
     for p, first in enumerate(reference):

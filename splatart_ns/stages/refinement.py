@@ -42,16 +42,23 @@ def increment(T: Tensor, xi: Tensor, centroid: Tensor, radius: float) -> Tensor:
 
 
 def refine(
-    pair: PartPair, T: Tensor, max_iterations: int = 6, hold_rotation: bool = False, with_scale: bool = False
+    pair: PartPair,
+    T: Tensor,
+    max_iterations: int = 6,
+    hold_rotation: bool = False,
+    with_scale: bool = False,
+    central: bool = False,
 ) -> Refinement:
     """Levenberg-Marquardt from T [4, 4] on all pixels of the pair, robust by Huber weights.
 
-    `hold_rotation` moves only the translation, `with_scale` lets T become a similarity.
+    `hold_rotation` moves only the translation, `with_scale` lets T become a similarity. `central` takes differences to
+    both sides, at nearly twice the renderings: those to one side err by half a step times how the residuals bend, which
+    ends the search too early where the residuals are large, as they are when cameras are not exact.
     """
     T = T.double()
     n = 3 if hold_rotation else 7 if with_scale else 6
     damping, converged = 1e-3, False
-    equations = _normal_equations(pair, T, n)
+    equations = _normal_equations(pair, T, n, central)
     iteration = 0
     while iteration < max_iterations and not converged:
         iteration += 1
@@ -62,7 +69,7 @@ def refine(
         if cost < equations.cost:
             converged = bool(step.abs().max() < 0.1 * STEP) or cost > (1 - 1e-4) * equations.cost
             T, damping = trial, damping * 0.3
-            equations = _normal_equations(pair, T, n)
+            equations = _normal_equations(pair, T, n, central)
         else:
             damping = max(damping, 1e-3) * 10
             converged = damping > 1e2 or bool(step.abs().max() < 0.1 * STEP)
@@ -80,26 +87,37 @@ class NormalEquations:
     cost: float
 
 
-def linearized(difference: Tensor, weight: Tensor, step: float) -> tuple[Tensor, Tensor, float]:
+def trial_steps(n: int, central: bool, like: Tensor) -> Tensor:
+    """Small motions [1 + n or 1 + 2n, max(n, 6)] to linearize about: none, one step along each of the first n
+    parameters and, if `central`, one back."""
+    steps = STEP * torch.eye(n, dtype=like.dtype, device=like.device)
+    steps = torch.cat([torch.zeros_like(steps[:1]), steps, *([-steps] if central else [])])
+    return pad(steps, (0, max(0, 6 - n)))
+
+
+def linearized(difference: Tensor, weight: Tensor, step: float, central: bool = False) -> tuple[Tensor, Tensor, float]:
     """Gauss-Newton's H [n, n] and g [n] of the Huber cost of one view, float64, and that cost.
 
     Args:
-        difference: What differs [1 + n, H, W, C]: at the point, and after a step along each parameter.
+        difference: What differs [1 + n, H, W, C]: at the point, and after a step along each parameter; if `central`
+            [1 + 2n, H, W, C], also after one back along each.
         weight: Of the pixels [H, W].
         step: Length of the steps, in the parameters' units.
     """
     r = difference[0].reshape(-1)
-    J = (difference[1:].reshape(len(difference) - 1, -1) - r) / step
+    after = difference[1:].reshape(len(difference) - 1, -1)
+    n = len(after) // 2
+    J = (after[:n] - after[n:]) / (2 * step) if central else (after - r) / step
     w = weight[..., None].expand(difference.shape[1:]).reshape(-1)
     wJ = J * (w * (HUBER / r.abs().clamp_min(1e-12)).clamp_max(1.0))
     return (wJ @ J.T).double(), (wJ @ r).double(), float((w * huber(r)).sum())
 
 
 @torch.no_grad()
-def _normal_equations(pair: PartPair, T: Tensor, n: int) -> NormalEquations:
-    steps = pad(STEP * torch.eye(n, dtype=T.dtype, device=T.device), (0, max(0, 6 - n), 1, 0))
-    motions = increment(T.expand(n + 1, 4, 4), steps, pair.centroid, pair.radius)
-    H, gradients, costs = zip(*(linearized(d, w, STEP) for d, w in pair.residuals(motions)), strict=True)
+def _normal_equations(pair: PartPair, T: Tensor, n: int, central: bool = False) -> NormalEquations:
+    steps = trial_steps(n, central, T)
+    motions = increment(T.expand(len(steps), 4, 4), steps, pair.centroid, pair.radius)
+    H, gradients, costs = zip(*(linearized(d, w, STEP, central) for d, w in pair.residuals(motions)), strict=True)
     return NormalEquations(sum(H), torch.stack(gradients), sum(costs) / max(pair.area, 1.0))
 
 
