@@ -34,7 +34,7 @@ SETTINGS = {
     "rasterizer": "auto",
     "joints": [],
     "worlds": "shared",
-    "refine_cameras": "off",
+    "refine_cameras": "auto",
 }
 
 

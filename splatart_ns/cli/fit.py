@@ -32,7 +32,7 @@ class Fit:
     """For states that were captured separately: rigid where the device measured lengths, similar where structure from
     motion gave each its own scale. The states are brought into the world of the first by the part --root, or one that
     is chosen. By default what the capture says."""
-    refine_cameras: Literal["auto", "on", "off"] = "off"
+    refine_cameras: Literal["auto", "on", "off"] = "auto"
     """Whether to correct the cameras' poses; auto does where the silhouettes contradict each other."""
     rasterizer: Rasterizer = "auto"
     """auto takes gsplat on CUDA, else numba where it is installed, else torch."""

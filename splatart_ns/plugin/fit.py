@@ -66,7 +66,7 @@ class Settings:
     rasterizer: Backend = "auto"
     joints: list[str] = field(default_factory=list)
     worlds: Worlds | None = None
-    refine_cameras: RefineCameras = "off"
+    refine_cameras: RefineCameras = "auto"
 
     def of(self, capture: Capture) -> Settings:
         """With what the capture says where nothing else was asked for."""
@@ -159,7 +159,7 @@ def fit(
     rasterizer: Backend = "auto",
     joints: tuple[str, ...] = (),
     worlds: Worlds | None = None,
-    refine_cameras: RefineCameras = "off",
+    refine_cameras: RefineCameras = "auto",
 ) -> Path:
     """Run what is missing of all stages and leave the bundle in `output_dir`.
 

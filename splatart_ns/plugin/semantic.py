@@ -50,7 +50,7 @@ class SemanticModelConfig(SplatartModelConfig):
     max_gaussians: int = 12000
     """Gaussians are not split or duplicated beyond this number, and 3 / 2 of those that start on the surroundings."""
     background_color: Literal["random", "black", "white"] = "random"
-    refine_cameras: RefineCameras = "off"
+    refine_cameras: RefineCameras = "auto"
     """Whether the cameras' poses are refined while geometry and colour learn; auto: if no hull fits the images."""
 
 
@@ -195,7 +195,7 @@ class SemanticPipeline(VanillaPipeline):
             state = self.datamanager.capture.states[self.datamanager.dataparser.config.state].name
             self.notes.append(
                 f"{state}: the silhouettes contradict each other by {self._slack} pixels, so cameras or masks are not "
-                "exact; try --refine-cameras auto."
+                "exact; --refine-cameras off leaves them so."
             )
         dataset = self.datamanager.train_dataset
         self._labelled = {i for i, frame in enumerate(dataset.metadata["frames"]) if frame.labels is not None}
