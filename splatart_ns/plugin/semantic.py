@@ -19,6 +19,7 @@ from splatart_ns.geometry.se3 import inverse
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.rasterize.ssim import l1_ssim_loss
 from splatart_ns.stages.camera_refinement import PASSES, camera_change, refine_cameras
+from splatart_ns.stages.exposure import at_gain, frame_gains
 from splatart_ns.stages.hull import carve, slack
 from splatart_ns.stages.semantic import (
     accumulation_loss,
@@ -34,6 +35,14 @@ HALF_SIZE = 0.4
 """The share of the first phase that sees images of half the size."""
 LEAST_PIXELS = 256
 """Images with fewer pixels along a side are always seen at their full size: at this one it was measured."""
+
+EVENED = (0.2, 0.4, 0.6)
+"""When frames are brought to one exposure, as shares of the steps on geometry and colour."""
+UNEVEN = 0.1
+"""Least standard deviation of the gains' logarithms at which they are: of even frames, light alone left 0.05."""
+
+LEAST_STEPS = 50
+"""A splat that has learned for fewer steps says nothing of exposures."""
 
 
 @dataclass
@@ -91,9 +100,12 @@ class SemanticModel(SplatartModel):
         # World to camera, OpenCV axes, of the training frames as they were last refined.
         self.register_buffer("viewmats", torch.eye(4, dtype=torch.float64).repeat(self.num_train_data, 1, 1))
         self.register_buffer("cameras_refined", torch.tensor(False))
+        # How many times brighter than their mean the training frames are, by channel.
+        self.register_buffer("gains", torch.ones(self.num_train_data, 3))
 
     def load_state_dict(self, state, **kwargs):
         self.viewmats = torch.zeros_like(state["viewmats"], device=self.device)
+        self.gains = torch.ones_like(state["gains"], device=self.device)
         return super().load_state_dict(state, **kwargs)
 
     @property
@@ -229,6 +241,7 @@ class SemanticPipeline(VanillaPipeline):
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         if self._refines:
             callbacks.append(TrainingCallback(before, self._refine_cameras))
+        callbacks.append(TrainingCallback(before, self._even_exposures))
         callbacks.append(TrainingCallback(before, self._keep_inside))
         callbacks.append(TrainingCallback(before, self._vote))
         return callbacks
@@ -264,6 +277,24 @@ class SemanticPipeline(VanillaPipeline):
                 f"{change.degrees:.2f} deg and moved by {change.percent:.2f} % of their distance, and now do so by "
                 f"{self._slack}."
             )
+
+    def _even_exposures(self, step: int) -> None:
+        """Where it is time for it and they differ, bring the training frames to one exposure."""
+        model = self.model
+        due = [at for at in EVENED if step == round(at * model.config.semantic_start)]
+        if not due or step < LEAST_STEPS:
+            return
+        found = frame_gains(model.splat.detach(), self._views, model.step // model.config.sh_degree_interval)
+        uneven = float((model.gains * found).log().std())
+        if uneven > UNEVEN:
+            model.gains = model.gains * found
+            self._views = [replace(v, rgb=at_gain(v.rgb, gain)) for v, gain in zip(self._views, found, strict=True)]
+            for data in self.datamanager.cached_train:
+                data["image"][..., :3] = at_gain(data["image"][..., :3], found[data["image_idx"]])
+        if due[-1] == EVENED[-1] and uneven > UNEVEN:
+            self.findings["exposure"] = {"log_deviation": uneven}
+            state = self.datamanager.capture.states[self.datamanager.dataparser.config.state].name
+            self.notes.append(f"{state}: the frames' exposures differ by {100 * uneven:.0f} %; they were evened.")
 
     def _vote(self, step: int) -> None:
         """Where the second phase begins: which frames' labels to trust, and what they say together."""

@@ -13,6 +13,7 @@ from splatart_ns.errors import InputError
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_config
 from splatart_ns.plugin.gaussians import splat_from_state
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.exposure import at_gain
 from splatart_ns.stages.semantic import ballots, trusted
 from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
 
@@ -43,7 +44,7 @@ def read_state(capture: Capture, state: int, run: Path, num_parts: int, device: 
         )
     if not bool((splat.part_ids > 0).any()):
         raise InputError(f"{run} learned no parts; train splatart-semantic longer, with labelled frames.")
-    views = _trusted([v.to(device) for v in _refined_views(capture, state, checkpoint)], splat, num_parts)
+    views = _trusted([v.to(device) for v in refined_views(capture, state, checkpoint)], splat, num_parts)
     views = [with_silhouette(view) or rendered_silhouette(view, splat) for view in views]
     return LabelledState(splat, views, bool(checkpoint["_model.cameras_refined"]))
 
@@ -66,15 +67,19 @@ def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
     return tuple(found[s] for s in range(num_states))
 
 
-def _refined_views(capture: Capture, state: int, checkpoint: dict[str, Tensor]) -> list[View]:
-    """The training views of a state with the cameras that its splatart-semantic run ended with."""
-    views, viewmats = load_views(capture, state, "train"), checkpoint.get("_model.viewmats", ())
-    if len(viewmats) != len(views):
+def refined_views(capture: Capture, state: int, checkpoint: dict[str, Tensor]) -> list[View]:
+    """The training views of a state with the cameras and exposures that its splatart-semantic run ended with."""
+    views = load_views(capture, state, "train")
+    viewmats, gains = (checkpoint.get(f"_model.{name}", ()) for name in ("viewmats", "gains"))
+    if not len(viewmats) == len(gains) == len(views):
         raise InputError(
             f"{capture.path}: {capture.states[state].name} has {len(views)} training frames, but its splatart-semantic "
-            f"run has {len(viewmats)}; train it again."
+            f"run has {len(viewmats)}, or is of an earlier version; train it again."
         )
-    return [replace(view, viewmat=viewmat.float()) for view, viewmat in zip(views, viewmats, strict=True)]
+    return [
+        replace(view, viewmat=viewmat.float(), rgb=at_gain(view.rgb, gain))
+        for view, viewmat, gain in zip(views, viewmats, gains, strict=True)
+    ]
 
 
 def _trusted(views: list[View], splat: Splat, num_parts: int) -> list[View]:

@@ -3,7 +3,10 @@ import shutil
 
 import cv2
 import numpy as np
+import pytest
 import torch
+
+from splatart_ns.plugin.semantic_run import refined_views
 
 
 def test_growth_stops_at_the_limit(capture_dir, semantic_trainer):
@@ -63,3 +66,32 @@ def test_labels_that_contradict_the_others_are_not_learned(capture_dir, semantic
     trainer = semantic_trainer(capture, steps=32, semantic_start=30)
     trainer.train()
     assert [note.split(":")[0] for note in trainer.pipeline.notes] == [str(file)]
+
+
+def test_frames_of_different_exposures_are_evened_also_for_the_next_stage(capture_dir, semantic_trainer, tmp_path):
+    capture, gains = shutil.copytree(capture_dir, tmp_path / "capture"), {}
+    meta = json.loads((capture / "state_00/transforms.json").read_text())
+    for k, name in enumerate(sorted(meta["train_filenames"])):
+        gains[name] = 0.6 if k % 2 else 1.0
+        image = cv2.imread(str(capture / "state_00" / name), cv2.IMREAD_UNCHANGED)
+        image[..., :3] = (image[..., :3] * gains[name]).round()
+        cv2.imwrite(str(capture / "state_00" / name), image)
+
+    pipeline = semantic_trainer(capture, steps=301, semantic_start=300).pipeline
+    pipeline.model.gauss_params["opacities"].data.fill_(5)
+    before = [data["image"].clone() for data in pipeline.datamanager.cached_train]
+    for step in (60, 120, 180):
+        pipeline._even_exposures(step)
+    assert pipeline.notes and "exposure" in pipeline.findings
+
+    names = [f.image.relative_to(capture / "state_00") for f in pipeline.datamanager.train_dataset.metadata["frames"]]
+    dark = torch.tensor([gains[str(name)] < 1 for name in names])
+    found = pipeline.model.gains.mean(1)
+    assert float(found[dark].mean() / found[~dark].mean()) == pytest.approx(0.6, abs=0.06)
+    for data, image in zip(pipeline.datamanager.cached_train, before, strict=True):
+        brighter = float(data["image"][..., :3].float().mean() / image[..., :3].float().mean())
+        assert (brighter > 1) == bool(dark[data["image_idx"]])
+        assert torch.equal(data["image"][..., 3:], image[..., 3:])
+    checkpoint = {"_model.viewmats": pipeline.model.viewmats, "_model.gains": pipeline.model.gains}
+    for view, kept in zip(refined_views(pipeline.datamanager.capture, 0, checkpoint), pipeline._views, strict=True):
+        assert int((view.rgb.int() - kept.rgb.int()).abs().max()) <= 3  # which was rounded after every time

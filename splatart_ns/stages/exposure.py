@@ -1,0 +1,43 @@
+"""Frames that were exposed differently, brought to one exposure: a phone's camera adapts between frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from splatart_ns.capture.view import View
+from splatart_ns.rasterize.render import render
+from splatart_ns.splats.splat import Splat
+
+CLIPPED = 250
+"""Pixels this bright may have been cut off and tell no gain."""
+
+
+@torch.no_grad()
+def frame_gains(splat: Splat, views: Sequence[View], sh_degree: int | None = None) -> Tensor:
+    """How many times brighter than the splat each view's image is, by channel [N, 3]; their geometric mean is 1.
+
+    Least squares between rendering and image on the object's pixels; 1 where none counts.
+    """
+    gains = []
+    for view in views:
+        camera = view.viewmat[None].to(splat.means), view.K[None].to(splat.means)
+        rendering = render(splat, *camera, view.width, view.height, with_depth=False, sh_degree=sh_degree)
+        counts = (rendering.accumulation[0] > 0.9) & (view.rgb < CLIPPED).all(-1, keepdim=True).to(splat.means.device)
+        if view.alpha is not None:
+            counts &= (view.alpha > 250)[..., None].to(counts.device)
+        shown = rendering.rgb[0] * counts
+        image = view.rgb.to(shown) / 255 * counts
+        among, own = (shown * image).sum((0, 1)), shown.square().sum((0, 1))
+        gains.append(torch.where((among > 0) & (own > 0), among / own.clamp_min(1e-12), 1.0))
+    gains = torch.stack(gains)
+    return gains / gains.log().mean(0).exp()
+
+
+def at_gain(rgb: Tensor, gain: Tensor) -> Tensor:
+    """An image [H, W, 3], uint8 or 0..1, without its gain [3]."""
+    top = 255 if rgb.dtype == torch.uint8 else 1
+    out = (rgb.float() / gain.to(rgb.device)).clamp(0, top)
+    return out.round().to(torch.uint8) if rgb.dtype == torch.uint8 else out

@@ -1,0 +1,51 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from part_scene import box, photograph
+
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.exposure import at_gain, frame_gains
+
+
+@pytest.fixture(scope="module")
+def scene():
+    splat = Splat.cat([box(1, (0.9, 0.6, 0.3), (0.0, 0.0, -0.3)), box(2, (0.7, 0.4, 0.12), (0.1, 0.0, 0.2))])
+    return splat, photograph(splat)
+
+
+def exposed(views, gains):
+    return [replace(v, rgb=at_gain(v.rgb, 1 / g)) for v, g in zip(views, gains, strict=True)]
+
+
+def test_frames_of_another_exposure_and_white_balance_are_told(scene):
+    splat, views = scene
+    gains = 0.7 + 0.6 * torch.rand(len(views), 3, generator=torch.Generator().manual_seed(0))
+    found = frame_gains(splat, exposed(views, gains))
+    assert torch.allclose(found, gains / gains.log().mean(0).exp(), rtol=0.05)
+
+
+def test_gains_are_undone_up_to_what_all_frames_share(scene):
+    splat, views = scene
+    gains = torch.linspace(0.7, 1.3, len(views))[:, None].expand(-1, 3)
+    found = frame_gains(splat, exposed(views, gains))
+    evened = exposed(exposed(views, gains), 1 / found)
+    assert float(frame_gains(splat, evened).log().abs().max()) < 0.02
+
+
+def test_exact_frames_need_no_gain(scene):
+    splat, views = scene
+    assert float(frame_gains(splat, views).log().abs().max()) < 0.02
+
+
+def test_a_frame_that_is_cut_off_everywhere_tells_no_gain(scene):
+    splat, views = scene
+    white = [replace(v, rgb=torch.full_like(v.rgb, 255)) if k == 0 else v for k, v in enumerate(views)]
+    assert torch.allclose(frame_gains(splat, white)[0], torch.ones(3), rtol=0.02)
+
+
+def test_an_image_keeps_its_type():
+    image = torch.tensor([[[100, 200, 50]]], dtype=torch.uint8)
+    gain = torch.tensor([0.5, 0.5, 2.0])
+    assert at_gain(image, gain).tolist() == [[[200, 255, 25]]]
+    assert torch.allclose(at_gain(image / 255, gain), torch.tensor([[[200 / 255, 1.0, 25 / 255]]]))
