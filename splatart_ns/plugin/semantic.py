@@ -91,9 +91,12 @@ class SemanticModel(SplatartModel):
         # World to camera, OpenCV axes, of the training frames as they were last refined.
         self.register_buffer("viewmats", torch.eye(4, dtype=torch.float64).repeat(self.num_train_data, 1, 1))
         self.register_buffer("cameras_refined", torch.tensor(False))
+        # Of the training frames: whether they have labels that do not contradict the others'.
+        self.register_buffer("trusted", torch.zeros(self.num_train_data, dtype=torch.bool))
 
     def load_state_dict(self, state, **kwargs):
-        self.viewmats = torch.zeros_like(state["viewmats"], device=self.device)
+        for name in ("viewmats", "trusted"):
+            setattr(self, name, torch.zeros_like(state[name], device=self.device))
         return super().load_state_dict(state, **kwargs)
 
     @property
@@ -277,6 +280,7 @@ class SemanticPipeline(VanillaPipeline):
             self.notes.append(f"{frames[i].labels}: contradicts the other frames' labels and is not used.")
             CONSOLE.log(self.notes[-1])
         self._labelled = {labelled[v] for v in kept.nonzero()[:, 0].tolist()}
+        self.model.trusted[sorted(self._labelled)] = True
         if self.model.config.vote_init and step == self.model.config.semantic_start:
             with torch.no_grad():
                 self.model.gauss_params["semantics"].copy_(vote_logits(votes[kept]))

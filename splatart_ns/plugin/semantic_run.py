@@ -13,7 +13,6 @@ from splatart_ns.errors import InputError
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_config
 from splatart_ns.plugin.gaussians import splat_from_state
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.semantic import ballots, trusted
 from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
 
 
@@ -43,7 +42,7 @@ def read_state(capture: Capture, state: int, run: Path, num_parts: int, device: 
         )
     if not bool((splat.part_ids > 0).any()):
         raise InputError(f"{run} learned no parts; train splatart-semantic longer, with labelled frames.")
-    views = _trusted([v.to(device) for v in _refined_views(capture, state, checkpoint)], splat, num_parts)
+    views = [view.to(device) for view in learned_views(capture, state, checkpoint)]
     views = [with_silhouette(view) or rendered_silhouette(view, splat) for view in views]
     return LabelledState(splat, views, bool(checkpoint["_model.cameras_refined"]))
 
@@ -66,20 +65,17 @@ def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
     return tuple(found[s] for s in range(num_states))
 
 
-def _refined_views(capture: Capture, state: int, checkpoint: dict[str, Tensor]) -> list[View]:
-    """The training views of a state with the cameras that its splatart-semantic run ended with."""
-    views, viewmats = load_views(capture, state, "train"), checkpoint.get("_model.viewmats", ())
-    if len(viewmats) != len(views):
+def learned_views(capture: Capture, state: int, checkpoint: dict[str, Tensor]) -> list[View]:
+    """The training views of a state as its splatart-semantic run saw them in the end: with the cameras that it refined,
+    and without the labels that it did not trust."""
+    views = load_views(capture, state, "train")
+    viewmats, trusted = (checkpoint.get(f"_model.{name}", ()) for name in ("viewmats", "trusted"))
+    if not len(viewmats) == len(trusted) == len(views):
         raise InputError(
-            f"{capture.path}: {capture.states[state].name} has {len(views)} training frames, but its splatart-semantic "
-            f"run has {len(viewmats)}; train it again."
+            f"{capture.path}: the splatart-semantic run of {capture.states[state].name} is of other training frames "
+            "than the capture's or of an earlier version; train it again."
         )
-    return [replace(view, viewmat=viewmat.float()) for view, viewmat in zip(views, viewmats, strict=True)]
-
-
-def _trusted(views: list[View], splat: Splat, num_parts: int) -> list[View]:
-    """The views of a state, without labels that contradict those of the other views."""
-    labelled = [i for i, view in enumerate(views) if view.labels is not None]
-    kept = trusted(ballots(splat, [views[i] for i in labelled], num_parts))
-    drop = {i for i, keep in zip(labelled, kept.tolist(), strict=True) if not keep}
-    return [replace(view, labels=None) if i in drop else view for i, view in enumerate(views)]
+    return [
+        replace(view, viewmat=viewmat.float(), labels=view.labels if trust else None)
+        for view, viewmat, trust in zip(views, viewmats, trusted.tolist(), strict=True)
+    ]

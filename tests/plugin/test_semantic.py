@@ -63,3 +63,6 @@ def test_labels_that_contradict_the_others_are_not_learned(capture_dir, semantic
     trainer = semantic_trainer(capture, steps=32, semantic_start=30)
     trainer.train()
     assert [note.split(":")[0] for note in trainer.pipeline.notes] == [str(file)]
+    frames = trainer.pipeline.datamanager.train_dataset.metadata["frames"]
+    trusted = [frame.labels is not None and frame.labels != file for frame in frames]
+    assert trainer.pipeline.model.trusted.tolist() == trusted

@@ -104,3 +104,11 @@ def test_a_turn_that_no_image_shows_is_uncertain():
     sigma = motion_covariance(pair, torch.eye(4)).diagonal().sqrt()
     assert sigma[5] > 1
     assert (sigma[:5] < 0.01).all()
+
+
+def test_equations_after_a_converged_step_are_those_measured_there(turned):
+    found = refine(turned, nearby(TURN, 0.02), max_iterations=30)
+    again = refine(turned, found.T, max_iterations=0)
+    assert found.converged and found.cost == pytest.approx(again.cost)
+    covariance, measured = (motion_covariance(turned, found.T, r.equations) for r in (found, again))
+    assert torch.linalg.norm(covariance - measured) < 0.05 * torch.linalg.norm(measured)
