@@ -257,7 +257,7 @@ class SemanticPipeline(VanillaPipeline):
         poses = inverse(model.viewmats) * torch.tensor([1.0, -1.0, -1.0, 1.0]).to(model.viewmats)
         cameras = self.datamanager.train_cameras.camera_to_worlds
         cameras.copy_(poses[:, :3].to(cameras))
-        self._slack = slack(self._views) if self._slack else 0
+        self._slack = slack(self._views)[0] if self._slack else 0
         if due[-1] is PASSES[-1]:
             change = camera_change(model.viewmats, self._given)
             self.findings["cameras"] = {**asdict(change), "slack_pixels": [self.datamanager.slack, self._slack]}
