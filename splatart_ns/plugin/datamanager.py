@@ -11,7 +11,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 
 from splatart_ns.capture.capture import UNLABELLED, Capture
 from splatart_ns.capture.view import View, load_points, load_view
-from splatart_ns.stages.hull import SeedPoints, seed_points, slack
+from splatart_ns.stages.hull import SeedPoints, seed_points, slack, visual_hull
 from splatart_ns.stages.silhouette import with_silhouette
 from splatart_ns.stages.surroundings import surrounding_points
 
@@ -82,14 +82,14 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         if any(view.alpha is None for view in views):
             outlined = [v for view in views if (v := with_silhouette(view)) is not None]
             around = surrounding_points(views, count, generator) if points is None else points.drawn(count, generator)
-            points = seed_points(outlined, num_parts, count, generator) if outlined else None
+            points = seed_points(outlined, num_parts, count, generator, visual_hull(outlined)) if outlined else None
             if points is not None:
                 points = points.joined(around)
                 self.train_dataset.metadata["points3D_around"] = len(around.xyz)
         else:
-            self.slack = slack(views)
+            self.slack, hull = slack(views)
             if points is None:
-                points = seed_points(views, num_parts, count, generator, slack=self.slack)
+                points = seed_points(views, num_parts, count, generator, hull)
         if points is not None:
             self.train_dataparser_outputs.metadata.update(points3D_xyz=points.xyz, points3D_rgb=points.rgb)
 

@@ -51,7 +51,7 @@ class Effort:
 
 EFFORTS: dict[Quality, Effort] = {
     "draft": Effort(gaussians=4000, steps=400, merge_steps=150),
-    "standard": Effort(gaussians=8000, steps=1000, merge_steps=400),
+    "standard": Effort(gaussians=8000, steps=1000, merge_steps=250),
     "high": Effort(gaussians=16000, steps=3000, merge_steps=1500),
 }
 
@@ -236,7 +236,11 @@ def _pose_config(capture: Capture, semantic_runs: list[Path], runs: Path, settin
     config = copy.deepcopy(pose_method.config)
     config.pipeline.semantic_runs = tuple(semantic_runs)
     config.pipeline.seed = settings.seed
-    config.max_num_iterations = config.pipeline.model.pose_steps + EFFORTS[settings.quality].merge_steps
+    merge_steps = EFFORTS[settings.quality].merge_steps
+    config.max_num_iterations = config.pipeline.model.pose_steps + merge_steps
+    for group, optimizer in config.optimizers.items():
+        if group != "part_poses":
+            optimizer["scheduler"].max_steps = merge_steps
     if settings.worlds != "shared":
         config.pipeline.root = settings.root
     return _placed(config, capture, 0, runs, "all", settings)

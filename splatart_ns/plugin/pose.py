@@ -314,6 +314,7 @@ class PosePipeline(VanillaPipeline):
             model.gauss_params[name] = parameter
             optimizers.optimizers[name].param_groups[0]["params"] = [parameter]
             optimizers.optimizers[name].state.clear()
+            optimizers.schedulers[name].last_epoch = 0  # the merged Gaussians' rates begin to decay
         optimizers.schedulers.pop("part_poses", None)  # they are final
         model.state_ids = torch.zeros(len(merged), dtype=torch.long, device=model.device)
         model.merged = torch.tensor(True, device=model.device)

@@ -102,10 +102,12 @@ class SemanticModel(SplatartModel):
         self.register_buffer("cameras_refined", torch.tensor(False))
         # How many times brighter than their mean the training frames are, by channel.
         self.register_buffer("gains", torch.ones(self.num_train_data, 3))
+        # Whether they have labels that do not contradict the others'.
+        self.register_buffer("trusted", torch.zeros(self.num_train_data, dtype=torch.bool))
 
     def load_state_dict(self, state, **kwargs):
-        self.viewmats = torch.zeros_like(state["viewmats"], device=self.device)
-        self.gains = torch.ones_like(state["gains"], device=self.device)
+        for name in ("viewmats", "gains", "trusted"):
+            setattr(self, name, torch.zeros_like(state[name], device=self.device))
         return super().load_state_dict(state, **kwargs)
 
     @property
@@ -267,7 +269,7 @@ class SemanticPipeline(VanillaPipeline):
         poses = inverse(model.viewmats) * torch.tensor([1.0, -1.0, -1.0, 1.0]).to(model.viewmats)
         cameras = self.datamanager.train_cameras.camera_to_worlds
         cameras.copy_(poses[:, :3].to(cameras))
-        self._slack = slack(self._views) if self._slack else 0
+        self._slack = slack(self._views)[0] if self._slack else 0
         if due[-1] is PASSES[-1]:
             change = camera_change(model.viewmats, self._given)
             self.findings["cameras"] = {**asdict(change), "slack_pixels": [self.datamanager.slack, self._slack]}
@@ -308,6 +310,7 @@ class SemanticPipeline(VanillaPipeline):
             self.notes.append(f"{frames[i].labels}: contradicts the other frames' labels and is not used.")
             CONSOLE.log(self.notes[-1])
         self._labelled = {labelled[v] for v in kept.nonzero()[:, 0].tolist()}
+        self.model.trusted[sorted(self._labelled)] = True
         if self.model.config.vote_init and step == self.model.config.semantic_start:
             with torch.no_grad():
                 self.model.gauss_params["semantics"].copy_(vote_logits(votes[kept]))

@@ -14,7 +14,6 @@ from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_c
 from splatart_ns.plugin.gaussians import splat_from_state
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.exposure import at_gain
-from splatart_ns.stages.semantic import ballots, trusted
 from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
 
 
@@ -44,7 +43,7 @@ def read_state(capture: Capture, state: int, run: Path, num_parts: int, device: 
         )
     if not bool((splat.part_ids > 0).any()):
         raise InputError(f"{run} learned no parts; train splatart-semantic longer, with labelled frames.")
-    views = _trusted([v.to(device) for v in refined_views(capture, state, checkpoint)], splat, num_parts)
+    views = [view.to(device) for view in learned_views(capture, state, checkpoint)]
     views = [with_silhouette(view) or rendered_silhouette(view, splat) for view in views]
     return LabelledState(splat, views, bool(checkpoint["_model.cameras_refined"]))
 
@@ -67,24 +66,17 @@ def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
     return tuple(found[s] for s in range(num_states))
 
 
-def refined_views(capture: Capture, state: int, checkpoint: dict[str, Tensor]) -> list[View]:
-    """The training views of a state with the cameras and exposures that its splatart-semantic run ended with."""
+def learned_views(capture: Capture, state: int, checkpoint: dict[str, Tensor]) -> list[View]:
+    """The training views of a state as its splatart-semantic run saw them in the end: with the cameras that it refined,
+    at one exposure, and without the labels that it did not trust."""
     views = load_views(capture, state, "train")
-    viewmats, gains = (checkpoint.get(f"_model.{name}", ()) for name in ("viewmats", "gains"))
-    if not len(viewmats) == len(gains) == len(views):
+    learned = [checkpoint.get(f"_model.{name}", ()) for name in ("viewmats", "gains", "trusted")]
+    if any(len(values) != len(views) for values in learned):
         raise InputError(
-            f"{capture.path}: {capture.states[state].name} has {len(views)} training frames, but its splatart-semantic "
-            f"run has {len(viewmats)}, or is of an earlier version; train it again."
+            f"{capture.path}: the splatart-semantic run of {capture.states[state].name} is of other training frames "
+            "than the capture's or of an earlier version; train it again."
         )
     return [
-        replace(view, viewmat=viewmat.float(), rgb=at_gain(view.rgb, gain))
-        for view, viewmat, gain in zip(views, viewmats, gains, strict=True)
+        replace(view, viewmat=viewmat.float(), rgb=at_gain(view.rgb, gain), labels=view.labels if trusted else None)
+        for view, viewmat, gain, trusted in zip(views, *learned, strict=True)
     ]
-
-
-def _trusted(views: list[View], splat: Splat, num_parts: int) -> list[View]:
-    """The views of a state, without labels that contradict those of the other views."""
-    labelled = [i for i, view in enumerate(views) if view.labels is not None]
-    kept = trusted(ballots(splat, [views[i] for i in labelled], num_parts))
-    drop = {i for i, keep in zip(labelled, kept.tolist(), strict=True) if not keep}
-    return [replace(view, labels=None) if i in drop else view for i, view in enumerate(views)]

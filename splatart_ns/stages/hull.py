@@ -21,6 +21,10 @@ UNCOVERED = 0.005
 that were half a degree and half a percent off, with thin parts, half."""
 
 
+Hull = tuple[Tensor, float]
+"""Centres [N, 3] of the occupied voxels, and the voxels' size."""
+
+
 @dataclass(frozen=True)
 class SeedPoints:
     """Points to start Gaussians from, in the normalised world."""
@@ -56,14 +60,16 @@ def carve(views: Sequence[View], grid: Tensor, dilate: int) -> Tensor:
     return inside & seen
 
 
-def slack(views: Sequence[View]) -> int:
-    """How many pixels silhouettes must be widened by before one hull fills all of them: 0 where the cameras are exact,
-    or some, or the largest of `SLACKS` where even that does not do."""
+def slack(views: Sequence[View]) -> tuple[int, Hull | None]:
+    """How many pixels silhouettes must be widened by before one hull fills all of them, and that hull.
+
+    0 where the cameras are exact, or some, or the largest of `SLACKS` where even that does not do.
+    """
     for pixels in SLACKS:
         hull = visual_hull(views, slack=pixels)
         if hull is not None and _uncovered(views, *hull) < UNCOVERED:
-            return pixels
-    return SLACKS[-1]
+            break
+    return pixels, hull
 
 
 def _uncovered(views: Sequence[View], voxels: Tensor, size: float) -> float:
@@ -79,8 +85,8 @@ def _uncovered(views: Sequence[View], voxels: Tensor, size: float) -> float:
     return missing / max(total, 1.0)
 
 
-def visual_hull(views: Sequence[View], resolution: int = 96, slack: int = 0) -> tuple[Tensor, float] | None:
-    """Centres [N, 3] of the occupied voxels and the voxels' size; None when no voxel is occupied.
+def visual_hull(views: Sequence[View], resolution: int = 96, slack: int = 0) -> Hull | None:
+    """The voxels inside all silhouettes; None when no voxel is occupied.
 
     The silhouettes are widened by `slack` pixels.
     Two passes: a coarse one finds the object's box, a fine one of `resolution` voxels along the longest side fills it.
@@ -100,12 +106,7 @@ def visual_hull(views: Sequence[View], resolution: int = 96, slack: int = 0) -> 
 
 
 def seed_points(
-    views: Sequence[View],
-    num_parts: int,
-    count: int,
-    generator: torch.Generator,
-    resolution: int = 96,
-    slack: int = 0,
+    views: Sequence[View], num_parts: int, count: int, generator: torch.Generator, hull: Hull | None
 ) -> SeedPoints | None:
     """`count` points inside the visual hull, parts below a least number filled up; None without a hull.
 
@@ -113,7 +114,6 @@ def seed_points(
     the views in whose silhouette it falls. The least number keeps small parts from starving: a finger of a robot would
     get a dozen points otherwise.
     """
-    hull = visual_hull(views, resolution, slack)
     if hull is None:
         return None
     voxels, size = hull

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -15,7 +16,9 @@ from splatart_ns.geometry.se3 import inverse
 from splatart_ns.geometry.similarity import inverse_similarity, view_of_moved
 from splatart_ns.rasterize.rasterization import rasterization, sh_colors
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.threads import side_by_side
 
+Measure = TypeVar("Measure")
 RGB_WEIGHT = 0.3
 """Weight of a colour difference against one of silhouettes: the pose is in the shape, light misleads."""
 CHROMA_WEIGHT = 2.0
@@ -166,28 +169,32 @@ class PartPair:
         """The part's own pixels in all views, at the size at which they are compared."""
         return sum(v.area / v.factor**2 for views in self.views for v in views)
 
-    def residuals(self, T: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """View by view, the differences [K, H, W, 4] under motions T [K, 4, 4] and the pixels' weights [H, W].
+    def of_views(self, T: Tensor, measure: Callable[[Tensor, Tensor], Measure]) -> list[Measure]:
+        """What `measure` says, view by view, of the differences [K, H, W, 4] under motions T [K, 4, 4] and the pixels'
+        weights [H, W].
 
         First the source's Gaussians moved by T in the target's views, then the target's moved back in the source's. T
         may be similarities.
         """
-        for splat, views, motion in zip(self.splats, reversed(self.views), (T, inverse_similarity(T)), strict=True):
-            for view in views:
-                yield view.difference(splat, motion, self.chroma_weight, self.brightness_weight), view.weight
+        ways = zip(self.splats, reversed(self.views), (T, inverse_similarity(T)), strict=True)
+        looks = [(splat, view, motion) for splat, views, motion in ways for view in views]
+
+        @torch.no_grad()
+        def look(seen: tuple[Splat, PartView, Tensor]) -> Measure:
+            splat, view, motion = seen
+            return measure(view.difference(splat, motion, self.chroma_weight, self.brightness_weight), view.weight)
+
+        return side_by_side(look, looks)
 
     def own_cost(self) -> float:
         """What `cost` would be if each state's Gaussians were looked at in their own state's views."""
         own = replace(self, splats=self.splats[::-1])
         return float(own.cost(torch.eye(4).to(self.centroid)[None])[0])
 
-    @torch.no_grad()
     def cost(self, T: Tensor) -> Tensor:
         """Mean Huber cost per own pixel of motions T [K, 4, 4]: [K] float64."""
-        total = torch.zeros(len(T), dtype=torch.float64, device=T.device)
-        for difference, weight in self.residuals(T):
-            total += (huber(difference).sum(-1) * weight).sum((1, 2)).double()
-        return total / max(self.area, 1.0)
+        costs = self.of_views(T, lambda difference, weight: (huber(difference).sum(-1) * weight).sum((1, 2)).double())
+        return sum(costs) / max(self.area, 1.0)
 
 
 def huber(r: Tensor) -> Tensor:

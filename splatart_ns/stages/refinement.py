@@ -62,14 +62,15 @@ def refine(
     iteration = 0
     while iteration < max_iterations and not converged:
         iteration += 1
-        H = equations.H + damping * equations.H.diagonal().clamp_min(1e-12).diag()
+        H = equations.H.sum(0)
+        H = H + damping * H.diagonal().clamp_min(1e-12).diag()
         step = -torch.linalg.solve(H, equations.g.sum(0))
         trial = increment(T, pad(step, (0, max(0, 6 - n))), pair.centroid, pair.radius)
         cost = float(pair.cost(trial[None])[0])
         if cost < equations.cost:
             converged = bool(step.abs().max() < 0.1 * STEP) or cost > (1 - 1e-4) * equations.cost
             T, damping = trial, damping * 0.3
-            equations = _normal_equations(pair, T, n, central)
+            equations = equations.after(step, cost) if converged else _normal_equations(pair, T, n, central)
         else:
             damping = max(damping, 1e-3) * 10
             converged = damping > 1e2 or bool(step.abs().max() < 0.1 * STEP)
@@ -81,10 +82,15 @@ class NormalEquations:
     """Of the Huber cost, in units of radii and radians."""
 
     H: Tensor
-    """[n, n]."""
+    """Of each view [V, n, n]."""
     g: Tensor
     """Of each view [V, n]."""
     cost: float
+    """Mean Huber cost per own pixel."""
+
+    def after(self, step: Tensor, cost: float) -> NormalEquations:
+        """What they are, to first order, after a small step [n] to where the cost was measured."""
+        return NormalEquations(self.H, self.g + self.H @ step, cost)
 
 
 def trial_steps(n: int, central: bool, like: Tensor) -> Tensor:
@@ -117,8 +123,8 @@ def linearized(difference: Tensor, weight: Tensor, step: float, central: bool = 
 def _normal_equations(pair: PartPair, T: Tensor, n: int, central: bool = False) -> NormalEquations:
     steps = trial_steps(n, central, T)
     motions = increment(T.expand(len(steps), 4, 4), steps, pair.centroid, pair.radius)
-    H, gradients, costs = zip(*(linearized(d, w, STEP, central) for d, w in pair.residuals(motions)), strict=True)
-    return NormalEquations(sum(H), torch.stack(gradients), sum(costs) / max(pair.area, 1.0))
+    H, gradients, costs = zip(*pair.of_views(motions, lambda d, w: linearized(d, w, STEP, central)), strict=True)
+    return NormalEquations(torch.stack(H), torch.stack(gradients), sum(costs) / max(pair.area, 1.0))
 
 
 def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | None = None) -> Tensor:
@@ -140,7 +146,7 @@ def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | No
     V, n = equations.g.shape
     g = equations.g - equations.g.mean(0)
     directions = torch.stack([d.sum(0) for d in g.split([len(pair.views[1]), len(pair.views[0])])])
-    H_inv = torch.linalg.inv(equations.H + variance / math.pi**2 * torch.eye(n).to(T))
+    H_inv = torch.linalg.inv(equations.H.sum(0) + variance / math.pi**2 * torch.eye(n).to(T))
     local = H_inv @ (V / max(V - n, 1) * g.T @ g + directions.T @ directions) @ H_inv + variance * H_inv
     # From (radii, radians) about the moved centroid to the world's origin.
     pivot = transform_points(T, pair.centroid[None])[0]

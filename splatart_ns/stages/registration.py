@@ -219,7 +219,7 @@ def _icp_step(
     turn: bool = True,
 ) -> np.ndarray:
     """One step of every motion: nearest points, trimming, the rigid fit (Kabsch 1976); without `turn` its slide."""
-    distance, nearest = target_tree.query(_moved_features(T, sample, colour))
+    distance, nearest = target_tree.query(_moved_features(T, sample, colour), workers=torch.get_num_threads())
     inlier = distance <= np.quantile(distance, 1 - trim, axis=1, keepdims=True)
     w = inlier / inlier.sum(axis=1, keepdims=True)
     goal = target.xyz[nearest]
@@ -238,5 +238,6 @@ def _icp_step(
 
 
 def _trimmed_distance(T: np.ndarray, sample: PartPoints, colour: float, tree: cKDTree, trim: float) -> np.ndarray:
-    distance = np.sort(tree.query(_moved_features(T, sample, colour))[0], axis=1)
+    distance = tree.query(_moved_features(T, sample, colour), workers=torch.get_num_threads())[0]
+    distance = np.sort(distance, axis=1)
     return distance[:, : max(1, round((1 - trim) * distance.shape[1]))].mean(axis=1)

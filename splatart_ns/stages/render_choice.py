@@ -22,6 +22,10 @@ COARSE_PIXELS = 1500
 """Choosing needs no more pixels a view than this."""
 TINY_PIXELS = 400
 """Searching widely needs no more than this."""
+GLANCE_VIEWS = 2
+"""Views of each state, of so few pixels, that tell hopeless candidates."""
+HOPELESS = 4.0
+"""These cost more than this many times the best."""
 FINE_PIXELS = 10000
 """Refining needs as many; coarse images would bias it."""
 SIMILAR = 2.5
@@ -80,11 +84,15 @@ def initial_motion(
         if identity_cost < STILL_RATIO * own_cost:  # no motion fits much better than a state's own Gaussians
             return InitialMotion(identity, found=True, still=True, cost=identity_cost, identity_ratio=1.0)
     found = register(source, target, seed).T
-    candidates = torch.from_numpy(np.concatenate([found, point_to_plane(source, target, found)])).to(identity)
+    candidates = torch.from_numpy(found).to(identity)
     if coarse is None or fine is None:
         return InitialMotion(candidates[0], found=True)
-    everything = torch.cat([identity[None], candidates])
-    candidates = choose(coarse, everything, SIMILAR)
+    candidates = torch.cat([identity[None], candidates])
+    glance = appearance_cost(part_pair(splats, views, part, GLANCE_VIEWS, TINY_PIXELS), candidates)
+    hopeful = candidates[torch.from_numpy(glance <= HOPELESS * glance.min())]
+    closer = torch.from_numpy(point_to_plane(source, target, hopeful.numpy(force=True))).to(identity)
+    everything, candidates = torch.cat([candidates, closer]), torch.cat([hopeful, closer])
+    candidates = choose(coarse, candidates, SIMILAR)
     if float(coarse.cost(identity[None])[0]) < STILL_RATIO * float(coarse.cost(candidates[:1])[0]):
         candidates = identity[None]
     if len(candidates) > 1:

@@ -10,6 +10,7 @@ from torch import Tensor
 from splatart_ns.capture.view import View
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.threads import side_by_side
 
 MAX_VIEWS = 40
 """More views than this add nothing to the answer."""
@@ -22,15 +23,16 @@ def visibility(splat: Splat, views: Sequence[View]) -> Tensor:
     weights, so one backward pass a view measures all Gaussians.
     """
     splat = splat.detach()
-    total = torch.zeros(len(splat), device=splat.means.device)
+    device = splat.means.device
     views = views[:: -(-len(views) // MAX_VIEWS)]
-    for view in views:
-        feature = torch.zeros(len(splat), 1, device=total.device, requires_grad=True)
-        camera = view.viewmat[None].to(total.device), view.K[None].to(total.device)
-        with torch.enable_grad():
-            image = render(splat, *camera, view.width, view.height, features=feature, with_depth=False, sh_degree=0)
-            total += torch.autograd.grad(image.features.sum(), feature)[0][:, 0]
-    return total / len(views)
+
+    def shown_by(view: View) -> Tensor:
+        feature = torch.zeros(len(splat), 1, device=device, requires_grad=True)
+        camera = view.viewmat[None].to(device), view.K[None].to(device)
+        image = render(splat, *camera, view.width, view.height, features=feature, with_depth=False, sh_degree=0)
+        return torch.autograd.grad(image.features.sum(), feature)[0][:, 0]
+
+    return sum(side_by_side(shown_by, views)) / len(views)
 
 
 def shown(seen: Tensor, share: float = 0.98) -> Tensor:

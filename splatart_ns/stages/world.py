@@ -67,7 +67,7 @@ def fit_world(
     T = refine(coarse, start.T, MAX_ITERATIONS, with_scale=with_scale).T
     found = refine(fine, T, 2 * MAX_ITERATIONS, with_scale=with_scale)
     covariance = torch.zeros(7, 7, dtype=torch.float64, device=T.device)
-    n = len(found.equations.H)
+    n = found.equations.H.shape[-1]
     covariance[:n, :n] = motion_covariance(fine, found.T, found.equations)
     ratio = found.cost / max(fine.own_cost(), 1e-12)
     return WorldFit(inverse_similarity(found.T) @ zoomed.to(found.T), covariance, ratio)

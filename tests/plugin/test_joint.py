@@ -179,6 +179,7 @@ def pose_state(merged: bool = True) -> dict[str, Tensor]:
         "_model.covariance": covariance,
         "_model.held_ratio": torch.full((2, 2), torch.nan),
         "_model.merged": torch.tensor(merged),
+        "_model.worlds": torch.eye(4).double().repeat(len(base), 1, 1),
     }
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatart_ns.plugin.semantic_run import refined_views
+from splatart_ns.plugin.semantic_run import learned_views
 
 
 def test_growth_stops_at_the_limit(capture_dir, semantic_trainer):
@@ -66,6 +66,9 @@ def test_labels_that_contradict_the_others_are_not_learned(capture_dir, semantic
     trainer = semantic_trainer(capture, steps=32, semantic_start=30)
     trainer.train()
     assert [note.split(":")[0] for note in trainer.pipeline.notes] == [str(file)]
+    frames = trainer.pipeline.datamanager.train_dataset.metadata["frames"]
+    trusted = [frame.labels is not None and frame.labels != file for frame in frames]
+    assert trainer.pipeline.model.trusted.tolist() == trusted
 
 
 def test_frames_of_different_exposures_are_evened_also_for_the_next_stage(capture_dir, semantic_trainer, tmp_path):
@@ -92,6 +95,6 @@ def test_frames_of_different_exposures_are_evened_also_for_the_next_stage(captur
         brighter = float(data["image"][..., :3].float().mean() / image[..., :3].float().mean())
         assert (brighter > 1) == bool(dark[data["image_idx"]])
         assert torch.equal(data["image"][..., 3:], image[..., 3:])
-    checkpoint = {"_model.viewmats": pipeline.model.viewmats, "_model.gains": pipeline.model.gains}
-    for view, kept in zip(refined_views(pipeline.datamanager.capture, 0, checkpoint), pipeline._views, strict=True):
+    checkpoint = {f"_model.{name}": getattr(pipeline.model, name) for name in ("viewmats", "gains", "trusted")}
+    for view, kept in zip(learned_views(pipeline.datamanager.capture, 0, checkpoint), pipeline._views, strict=True):
         assert int((view.rgb.int() - kept.rgb.int()).abs().max()) <= 3  # which was rounded after every time

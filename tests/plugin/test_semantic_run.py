@@ -1,12 +1,30 @@
 """Reading what stage 1 left."""
 
 import pytest
+import torch
 
+from splatart_ns.capture.check import require_valid
+from splatart_ns.capture.view import load_views
 from splatart_ns.errors import InputError
-from splatart_ns.plugin.semantic_run import find_semantic_runs
+from splatart_ns.plugin.semantic_run import find_semantic_runs, learned_views
 
 
 def test_semantic_runs_that_are_not_there_are_named_by_state(capture_dir, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="--state 0"):
         find_semantic_runs(capture_dir, 2)
+
+
+def test_views_are_seen_as_stage_1_left_them(capture_dir):
+    capture = require_valid(capture_dir)
+    views = load_views(capture, 0, "train")
+    labelled = [view.labels is not None for view in views]
+    trusted = torch.tensor(labelled)
+    trusted[labelled.index(True)] = False
+    moved = torch.stack([view.viewmat for view in views]).double() + 0.01
+    checkpoint = {"_model.viewmats": moved, "_model.gains": torch.ones(len(views), 3), "_model.trusted": trusted}
+    seen = learned_views(capture, 0, checkpoint)
+    assert [view.labels is not None for view in seen] == trusted.tolist()
+    assert torch.equal(torch.stack([view.viewmat for view in seen]), moved.float())
+    with pytest.raises(InputError, match="train it again"):
+        learned_views(capture, 0, {"_model.viewmats": moved, "_model.gains": checkpoint["_model.gains"]})

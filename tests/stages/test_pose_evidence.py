@@ -44,9 +44,9 @@ def test_the_last_refinement_looks_at_hues(monkeypatch):
     """What it gains was measured on fits (README); a scene as small as this one is held by its silhouettes."""
     weights = []
 
-    def watched(pair, *args):
+    def watched(pair, *args, **options):
         weights.append(pair.chroma_weight)
-        return refine(pair, *args)
+        return refine(pair, *args, **options)
 
     monkeypatch.setattr(pose_evidence, "refine", watched)
     truth = motion((0, 0, 20), (0.1, 0.0, 0.0))

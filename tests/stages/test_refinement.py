@@ -116,3 +116,11 @@ def test_differences_to_both_sides_are_not_misled_by_large_residuals_that_bend()
     assert abs(float(forward[1])) > 5e-4
     assert abs(float(central[1])) < 1e-9
     assert central[2] == forward[2]
+
+
+def test_equations_after_a_converged_step_are_those_measured_there(turned):
+    found = refine(turned, nearby(TURN, 0.02), max_iterations=30)
+    again = refine(turned, found.T, max_iterations=0)
+    assert found.converged and found.cost == pytest.approx(again.cost)
+    covariance, measured = (motion_covariance(turned, found.T, r.equations) for r in (found, again))
+    assert torch.linalg.norm(covariance - measured) < 0.05 * torch.linalg.norm(measured)

@@ -1,0 +1,48 @@
+import threading
+
+import pytest
+import torch
+
+from splatart_ns.stages.threads import side_by_side
+
+
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_results_come_in_order_from_as_many_threads_as_torch_has(two_threads):
+    both = threading.Barrier(2, timeout=20)  # breaks unless two run at the same time
+
+    def function(item: int) -> tuple[int, int]:
+        both.wait()
+        return item, torch.get_num_threads()
+
+    assert side_by_side(function, range(4)) == [(i, 1) for i in range(4)]
+    assert torch.get_num_threads() == 2
+
+
+def test_threads_that_start_later_have_torchs_number_again(two_threads):
+    side_by_side(lambda item: item, range(2))
+    found = []
+    later = threading.Thread(target=lambda: found.append(torch.get_num_threads()))
+    later.start()
+    later.join()
+    assert found == [2]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_gradients_are_recorded_also_where_the_caller_wants_none(two_threads, threads):
+    torch.set_num_threads(threads)
+    with torch.no_grad():
+        slopes = side_by_side(lambda x: torch.autograd.grad(x.square(), x)[0], [torch.tensor(3.0, requires_grad=True)])
+    assert slopes == [6.0]
+
+
+def test_an_error_of_an_item_reaches_the_caller(two_threads):
+    with pytest.raises(ZeroDivisionError):
+        side_by_side(lambda item: 1 / item, [1, 0])
+    assert torch.get_num_threads() == 2
