@@ -20,21 +20,33 @@ _TOUCHING = 0.01  # share of a part's points that counts as its contact
 
 @dataclass(frozen=True)
 class Contact:
-    """How close two parts stay."""
+    """How close two parts stay, to each other and to the axis of a joint."""
 
     gap: float
     """1st percentile of the distances from one part's points to the other part, the largest over the states."""
     points: Tensor
     """The points [K, 3] of either part that stay closest to the other in all states, canonical frame."""
 
+    parts: tuple[Tensor, Tensor]
+    """Points [N, 3] of both parts, where these are at state 0."""
+
     def distance_to_axis(self, axis: Tensor, origin: Tensor) -> float:
-        """Median distance of the contact from the line through `origin` [3] along the unit vector `axis` [3]."""
-        across = torch.linalg.cross(self.points - origin, axis.expand_as(self.points))
-        return float(torch.linalg.vector_norm(across, dim=-1).median())
+        """How far the line through `origin` [3] along the unit vector `axis` [3] passes by the two parts, added up.
+
+        That of their contact would not do: what two knobs have nearest to each other lies on a wrong axis between them
+        as near as the rim of a knob, behind which the panel is hidden, to the right one.
+        """
+        across = (torch.linalg.cross(points - origin, axis.expand_as(points)) for points in self.parts)
+        return sum(_nearest(torch.linalg.vector_norm(x, dim=-1)) for x in across)
 
     def distance_to_point(self, point: Tensor) -> float:
-        """Median distance of the contact from a point [3]."""
-        return float(torch.linalg.vector_norm(self.points - point, dim=-1).median())
+        """How far a point [3] lies from the two parts, added up."""
+        return sum(_nearest(torch.linalg.vector_norm(points - point, dim=-1)) for points in self.parts)
+
+
+def _nearest(distances: Tensor) -> float:
+    """1st percentile of distances [N]: no stray point decides."""
+    return float(distances.kthvalue(max(1, round(_TOUCHING * len(distances)))).values)
 
 
 def find_contacts(
@@ -75,4 +87,4 @@ def _contact(points_a: Tensor, points_b: Tensor, tree_a: cKDTree, tree_b: cKDTre
     for points, distances in ((points_a, from_a), (points_b, from_b)):
         count = max(1, round(_TOUCHING * len(points)))
         staying.append(points[torch.from_numpy(distances.max(0).argsort()[:count]).to(points.device)])
-    return Contact(float(gap), torch.cat(staying))
+    return Contact(float(gap), torch.cat(staying), (points_a, points_b))

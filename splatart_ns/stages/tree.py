@@ -2,8 +2,8 @@
 
 All pairs of parts are fitted; the pairs whose fit is accepted make the graph; the tree is the spanning arborescence
 of least cost. A pair costs what speaks against a joint there, in shares of the object's radius: the residual, the gap
-between the two parts (a joint keeps them in touch), the distance of a turning axis from the place where they touch, a
-little if the parent is not the root, and 1 for every degree of freedom beyond the first: two hinges in a row look
+between the two parts (a joint keeps them in touch), how far a turning axis passes by the two parts, a little if the
+parent is not the root, and 1 for every degree of freedom beyond the first: two hinges in a row look
 like one joint of more freedom. With two states kinematics alone cannot find the tree: about as many false pairs as
 true ones move like joints, two drawers for instance. Contact tells them apart.
 

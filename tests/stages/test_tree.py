@@ -461,6 +461,8 @@ def test_between_nearly_equal_parents_the_root_wins(closer, parent):
     joints = {(1, 2): slide([0.0, 0.2]), (1, 3): slide([0.0, 0.3]), (2, 3): slide([0.0, 0.1])}
     joints |= {(b, a): fit for (a, b), fit in joints.items()}
     gaps = {(1, 2): 0.02, (1, 3): 0.06, (2, 3): 0.06 - closer}
-    contacts = {pair: Contact(gap, torch.zeros(1, 3).double()) for pair, gap in gaps.items()}
+    contacts = {
+        pair: Contact(gap, torch.zeros(1, 3).double(), 2 * (torch.zeros(1, 3).double(),)) for pair, gap in gaps.items()
+    }
     tree = build_tree([1, 2, 3], joints, contacts, 1, 1.0)
     assert {j.child: j.parent for j in tree.joints} == {2: 1, 3: parent}
