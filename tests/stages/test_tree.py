@@ -466,3 +466,27 @@ def test_between_nearly_equal_parents_the_root_wins(closer, parent):
     }
     tree = build_tree([1, 2, 3], joints, contacts, 1, 1.0)
     assert {j.child: j.parent for j in tree.joints} == {2: 1, 3: parent}
+
+
+def test_knobs_beside_each_other_hang_on_the_panel_behind_them():
+    """Only their faces are seen, and the panel not behind them; the relative motion turns about a line between them."""
+    centres = {2: torch.tensor([-0.17, 0, 0.06]).double(), 3: torch.tensor([0.17, 0, 0.06]).double()}
+    panel = box((0, 0, 0), (1.6, 1.2, 0), seed=0, count=4000)
+    hidden = torch.stack([torch.linalg.vector_norm((panel - c)[:, :2], dim=-1) < 0.15 for c in centres.values()])
+    points = {1: panel[~hidden.any(0)]}
+    for part, centre in centres.items():
+        face = box((0, 0, 0.05), (0.24, 0.24, 0.1), seed=part, count=1500)
+        points[part] = centre + face[torch.linalg.vector_norm(face[:, :2], dim=-1) < 0.12]
+    truth = KinematicTree([1, 2, 3], 1, [true_joint(1, p, "revolute", Z, c) for p, c in centres.items()])
+    motions = motions_of(truth, torch.tensor([[0.0, 0.0], [-0.6, 0.6]]))
+    assert edges(infer_tree(points, motions)) == {(1, 2), (1, 3)}
+
+
+def test_a_thin_part_that_images_show_turning_about_its_length_turns():
+    points = {1: box((0, 0, -0.5), (2, 2, 1), seed=0), 2: rod((0, 0, 0), (0, 0, 0.3), 0.06, seed=1)}
+    truth = KinematicTree([1, 2], 1, [true_joint(1, 2, "revolute", Z, torch.zeros(3))])
+    motions = motions_of(truth, torch.tensor([[0.0], [math.radians(21)]]))
+    seen = torch.diag(torch.tensor([1e-4] * 3 + [2e-3] * 3).double() ** 2).repeat(2, 1, 1)
+    (joint,) = infer_tree(points, motions, covariances={1: 0 * seen, 2: seen}).joints
+    assert joint.fit.type == "revolute"
+    assert abs(float(joint.fit.values[1])) == pytest.approx(math.radians(21), abs=1e-3)
