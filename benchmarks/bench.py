@@ -24,6 +24,7 @@ import time
 from pathlib import Path
 from typing import Annotated, Any
 
+import psutil
 import tyro
 from bench_plan import FULL, QUICK, Point, Scene, growths, trade_offs
 from bench_report import write_report
@@ -110,7 +111,7 @@ def run(point: Point, folder: Path) -> dict[str, Any]:
         "quality": point.quality,
         "settings": list(point.settings),
         "at": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "load_before": os.getloadavg()[0],
+        "busy_before": psutil.cpu_percent(interval=1.0) / 100,
         "machine": machine(),
     }
     start = time.monotonic()

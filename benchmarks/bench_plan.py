@@ -104,12 +104,7 @@ QUICK = Extent(
     image_parts=(2,),
     labelled=(0.1,),
     slow_everywhere=False,
-    growths={
-        "Gaussians": (5000, 20000, 80000),
-        "pixels a side": (128, 512, 1024),
-        "parts": (2, 8, 30),
-        "states": (2, 5, 10),
-    },
+    growths={"Gaussians": (5000, 40000), "pixels a side": (128, 512), "parts": (2, 8), "states": (2, 5)},
 )
 FULL = Extent(
     parts=(2, 3, 5),

@@ -27,7 +27,7 @@ def record(point, seconds, motion, load=0.0, **others):
         "size": point.size,
         "seed": point.seed,
         "quality": point.quality,
-        "load_before": load,
+        "busy_before": load,
         "machine": MACHINE,
         "seconds": seconds,
         "import_seconds": 4.0,
@@ -94,7 +94,7 @@ def test_the_document_says_when_the_machine_was_busy_and_what_failed(tmp_path):
     plan = trade_offs(QUICK, [])[:2]
     busy = record(plan[0], 10.0, 1.0, load=4.0)
     failed = {
-        k: v for k, v in record(plan[1], 1.0, 1.0).items() if k in ("key", "size", "group", "load_before", "machine")
+        k: v for k, v in record(plan[1], 1.0, 1.0).items() if k in ("key", "size", "group", "busy_before", "machine")
     }
     text = written(tmp_path, plan, [busy, failed | {"failed": "error: no parts"}])
     assert "1 fits began while the machine had other work" in text and f"- {plan[1].key}: error: no parts" in text
@@ -106,7 +106,7 @@ def test_growth_and_profile_are_told(tmp_path):
     profile = {"rasterization": 6.0, "image losses": 1.0, "imports": 3.0}
     records.append(record(replace(plan[0], group="profile", size=None), 10.0, 1.0, profile=profile))
     text = written(tmp_path, plan, records)
-    assert "| parts | 2 to 30 | all | 4 to 60 | 1.00 | 1.00 | 900 to 900 |" in text
+    assert "| parts | 2 to 8 | all | 4 to 16 | 1.00 | 1.00 | 900 to 900 |" in text
     assert "Outside rasterization and image losses: **30%**" in text and "| rasterization | 6.0 | 60.0% |" in text
 
 
