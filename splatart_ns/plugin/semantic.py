@@ -40,7 +40,6 @@ EVENED = (0.2, 0.4, 0.6)
 """When frames are brought to one exposure, as shares of the steps on geometry and colour."""
 UNEVEN = 0.1
 """Least standard deviation of the gains' logarithms at which they are: of even frames, light alone left 0.05."""
-
 LEAST_STEPS = 50
 """A splat that has learned for fewer steps says nothing of exposures."""
 

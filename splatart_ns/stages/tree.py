@@ -91,14 +91,14 @@ def infer_tree(
         # If it turned unseen, so did all that hangs on it.
         covariances = covariances | {root: 0 * covariances[root]}
     floor = noise if covariances is None else _SEEN_NOISE * noise
-    known_by = {"covariances": covariances, "noise": floor, "epsilon": epsilon}
+    certainty = {"covariances": covariances, "noise": floor, "epsilon": epsilon}
     if method == "descent":
         joints = descend_pairs(points, motions, radius, epsilon)
     else:
-        joints = fit_pairs(points, motions, radius, render_ratios=render_ratios, **known_by)
+        joints = fit_pairs(points, motions, radius, render_ratios=render_ratios, **certainty)
     for c in sorted(constraints, key=lambda c: not c.forbidden):
         pair = {p: points[p] for p in (c.parent, c.child)}
-        told = told_pair(c, joints, pair, motions, radius, **known_by)
+        told = told_pair(c, joints, pair, motions, radius, **certainty)
         joints = {edge: fit for edge, fit in joints.items() if set(edge) != set(pair)} | told
     # A part of which nothing tells where it is at state 0 hangs on others, and nothing hangs on it.
     joints = {(a, b): fit for (a, b), fit in joints.items() if a not in lost}
