@@ -451,16 +451,20 @@ def test_a_required_joint_that_nothing_explains_is_free():
     assert {j.child: j.fit.type for j in tree.joints} == {2: "prismatic", 3: "free"} and not tree.unattached
 
 
-@pytest.mark.parametrize("closer, parent", [(0.01, 1), (0.05, 2)])
-def test_between_nearly_equal_parents_the_root_wins(closer, parent):
-    """Part 3 slides against the root and against part 2, and is by `closer` radii nearer to part 2."""
+@pytest.mark.parametrize(
+    "kind, closer, parent",
+    [("prismatic", 0.07, 1), ("prismatic", 0.15, 2), ("revolute", 0.01, 1), ("revolute", 0.05, 2)],
+)
+def test_between_nearly_equal_parents_the_root_wins(kind, closer, parent):
+    """Part 3 moves against the root and against part 2, and is by `closer` radii nearer to part 2. Of slides along one
+    way it takes more: two drawers show that they are neighbours, and not where they touch the body."""
 
-    def slide(values):
-        return JointFit("prismatic", X, torch.zeros(3).double(), 0.0, torch.tensor(values).double(), residual=0.0)
+    def move(values):
+        return JointFit(kind, X, torch.zeros(3).double(), 0.0, torch.tensor(values).double(), residual=0.0)
 
-    joints = {(1, 2): slide([0.0, 0.2]), (1, 3): slide([0.0, 0.3]), (2, 3): slide([0.0, 0.1])}
+    joints = {(1, 2): move([0.0, 0.2]), (1, 3): move([0.0, 0.3]), (2, 3): move([0.0, 0.1])}
     joints |= {(b, a): fit for (a, b), fit in joints.items()}
-    gaps = {(1, 2): 0.02, (1, 3): 0.06, (2, 3): 0.06 - closer}
+    gaps = {(1, 2): 0.02, (1, 3): 0.16, (2, 3): 0.16 - closer}
     contacts = {
         pair: Contact(gap, torch.zeros(1, 3).double(), 2 * (torch.zeros(1, 3).double(),)) for pair, gap in gaps.items()
     }
