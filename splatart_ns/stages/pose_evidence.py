@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.view import View
-from splatart_ns.geometry.se3 import inverse, so3_log
+from splatart_ns.geometry.se3 import inverse, so3_log, transform_points
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.part_pair import CHROMA_WEIGHT, part_pair
-from splatart_ns.stages.refinement import motion_covariance, refine, rotation_held_ratio
+from splatart_ns.stages.joint import PRISMATIC_BELOW
+from splatart_ns.stages.part_pair import CHROMA_WEIGHT, PartPair, part_pair
+from splatart_ns.stages.refinement import motion_covariance, refine, rotation_held_ratio, shifted
 from splatart_ns.stages.render_choice import FINE_PIXELS, VIEWS
 from splatart_ns.stages.symmetry import settle_turn
 
@@ -33,6 +34,9 @@ def refine_poses(
     light stays in the world while parts turn; silhouettes and hues of all views hold it. A round part's turn about its
     own axis is settled by trying all of them (`settle_turn`), also where the pose is to stay as it is.
 
+    Where a part rests, one that slides past it does not turn: what it seems to turn by is error, which its shift makes
+    up for. So parts whose images fit a mere shift as well are held to that.
+
     Args:
         splats: One labelled splat per state.
         views: Training views of each state.
@@ -47,8 +51,10 @@ def refine_poses(
     T = T.clone()
     S, P = T.shape[:2]
     covariances = torch.zeros(S, P, 6, 6, dtype=torch.float64, device=T.device)
-    for s in range(1, S):
-        for p in range(P):
+    something_rests = bool(frozen[1:].all(0).any())
+    for p in range(P):
+        refined, slides = 0, {}
+        for s in range(1, S):
             pair = part_pair((splats[0], splats[s]), (views[0], views[s]), p + 1, ALL_VIEWS, FINE_PIXELS)
             if pair is None:
                 covariances[s, p] = torch.nan
@@ -62,7 +68,23 @@ def refine_poses(
                 found = refine(pair, turned, MAX_ITERATIONS, central=central)
                 T[s, p], equations = found.T, found.equations
             covariances[s, p] = motion_covariance(pair, T[s, p], equations) + untold
+            if something_rests and not frozen[s, p]:
+                refined += 1
+                if not untold.any() and _may_have_slid(pair, T[s, p]):
+                    slide = shifted(pair, T[s, p], central=central)
+                    if slide.cost < PRISMATIC_BELOW * found.cost:
+                        slides[s] = slide.T, motion_covariance(pair, slide.T, slide.equations)
+        if len(slides) == refined:
+            for s, (slid, covariance) in slides.items():
+                T[s, p], covariances[s, p] = slid, covariance
     return T, covariances
+
+
+def _may_have_slid(pair: PartPair, T: Tensor) -> bool:
+    """Whether a motion [4, 4] turns a part little, and less than it shifts it."""
+    angle = float(so3_log(T[:3, :3]).norm())
+    shift = float((transform_points(T, pair.centroid[None])[0] - pair.centroid).norm())
+    return angle < MAYBE_SLIDING and shift > angle * pair.radius
 
 
 def rotation_held_ratios(splats: Sequence[Splat], views: Sequence[Sequence[View]], T: Tensor) -> Tensor:

@@ -130,7 +130,8 @@ def _normal_equations(pair: PartPair, T: Tensor, n: int, central: bool = False) 
 def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | None = None) -> Tensor:
     """How uncertain a refined motion T [4, 4] is [6, 6] float64; `equations`: those of its `Refinement`, if it has one.
 
-    [7, 7] for a similarity, whose equations have a scale: its logarithm comes last.
+    [7, 7] for a similarity, whose equations have a scale: its logarithm comes last. Where the equations are of a mere
+    translation, the rotation counts as known.
 
     The tangent is (translation, rotation) of a left increment in the world frame: T = se3_exp(xi) T_true, so that the
     translation is that of the world's origin. A sandwich estimate with views as clusters (Liang and Zeger 1986):
@@ -150,12 +151,23 @@ def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | No
     local = H_inv @ (V / max(V - n, 1) * g.T @ g + directions.T @ directions) @ H_inv + variance * H_inv
     # From (radii, radians) about the moved centroid to the world's origin.
     pivot = transform_points(T, pair.centroid[None])[0]
-    A = torch.eye(n, dtype=T.dtype, device=T.device)
+    A = torch.eye(max(n, 6), n, dtype=T.dtype, device=T.device)
     A[:3, :3] *= pair.radius
-    A[:3, 3:6] = skew(pivot)
+    if n >= 6:
+        A[:3, 3:6] = skew(pivot)
     if n == 7:
         A[:3, 6] = -pivot
     return A @ local @ A.T
+
+
+def shifted(
+    pair: PartPair, T: Tensor, R: Tensor | None = None, max_iterations: int = 6, central: bool = False
+) -> Refinement:
+    """The best motion with the rotation R [3, 3], by default none, from where T [4, 4] puts the part's centroid."""
+    R = torch.eye(3).to(T) if R is None else R.to(T)
+    moved = transform_points(T, pair.centroid[None])[0]
+    start = from_rotation_translation(R, moved - R @ pair.centroid)
+    return refine(pair, start, max_iterations, hold_rotation=True, central=central)
 
 
 def rotation_held_ratio(pair: PartPair, T: Tensor, R: Tensor) -> float:
@@ -165,7 +177,4 @@ def rotation_held_ratio(pair: PartPair, T: Tensor, R: Tensor) -> float:
     near 1 for parts that slide and above 5 for parts that turn; 1.2 separates them.
     """
     free = refine(pair, T)
-    moved = transform_points(free.T, pair.centroid[None])[0]
-    R = R.to(free.T)
-    held = refine(pair, from_rotation_translation(R, moved - R @ pair.centroid), hold_rotation=True)
-    return held.cost / max(free.cost, 1e-12)
+    return shifted(pair, free.T, R).cost / max(free.cost, 1e-12)

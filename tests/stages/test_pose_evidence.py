@@ -40,6 +40,18 @@ def test_poses_are_refined_but_for_frozen_ones_and_covariances_are_proper():
     assert (torch.linalg.eigvalsh(covariance[1]) > -1e-12).all()
 
 
+def test_a_part_that_slides_past_one_that_rests_is_held_unturned_and_one_that_turns_is_not():
+    slide, tilted, turn = (motion((0, 0, degrees), (0.3, 0.1, 0.0)) for degrees in (0, 0.5, 8))
+    for truth, start, rests in ((slide, tilted, True), (slide, tilted, False), (turn, turn, True)):
+        frozen = torch.tensor([[True, True], [rests, False]])
+        T, covariance = refine_poses(*two_states(truth), poses_of(start), frozen)
+        held = rests and truth is slide
+        assert torch.equal(T[1, 1, :3, :3], torch.eye(3).double()) == held
+        assert bool((covariance[1, 1, 3:] == 0).all()) == held
+        assert (torch.linalg.eigvalsh(covariance[1, 1])[-3:] > 0).all()
+        assert (T[1, 1, :3, 3] - truth[:3, 3]).norm() < 0.01
+
+
 def test_the_last_refinement_looks_at_hues(monkeypatch):
     """What it gains was measured on fits (README); a scene as small as this one is held by its silhouettes."""
     weights = []
