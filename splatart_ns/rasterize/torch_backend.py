@@ -27,7 +27,7 @@ from splatart_ns.rasterize.torch_binning import LAYERS, MAX_ALPHA, MIN_ALPHA, TI
 
 BLOCKS = 12
 """Most blocks of LAYERS pairs that a tile walks before tiles that are opaque are left."""
-SLOTS = 16384
+SLOTS = 8192
 """Pairs in one step."""
 KEPT_BYTES = 24 * 2**20
 """Alphas and weights that forward keeps for backward, which composes again what is beyond. glibc keeps the pages of an
@@ -161,9 +161,10 @@ class _Workspace:
         shape = T, layers + more, blocks, _PIXELS
         return self.memory[i, : math.prod(shape)].view(shape)
 
-    def blend(self, step: _Step, saturates: bool):
-        """`step.blend` in the first three buffers."""
-        return step.blend(saturates, self.buffer(0, step), self.buffer(1, step), self.buffer(2, step, 1))
+    def blend(self, step: _Step, saturates: bool, first: int) -> tuple[Tensor, Tensor, Tensor]:
+        """`step.blend` in the buffers `first` and the next, with the first of all as scratch."""
+        alpha, weight = (self.buffer(i, step) for i in (first, first + 1))
+        return step.blend(saturates, alpha, weight, self.buffer(0, step, 1))
 
 
 def _batches(tiles: Tensor, counts: Tensor) -> Iterator[tuple[Tensor, int]]:
@@ -194,9 +195,9 @@ def _composite(pairs: Pairs, grid: Grid, keep_steps: bool, kept_bytes: int) -> t
             if 2 * size <= len(kept):
                 alpha, weight = kept[: 2 * size].view(2, *step.shape, _PIXELS)
                 kept = kept[2 * size :]
-                blended = step.blended = step.blend(pairs.saturates, alpha, weight, workspace.buffer(2, step, 1))
+                blended = step.blended = step.blend(pairs.saturates, alpha, weight, workspace.buffer(0, step, 1))
             else:
-                blended = workspace.blend(step, pairs.saturates)
+                blended = workspace.blend(step, pairs.saturates, 1)
             _, weight, passed = blended
             image.index_add_(0, tiles, torch.bmm(step.columns[8:].transpose(0, 1), weight.flatten(1, 2)))
             transmittance.index_copy_(0, tiles, passed[:, -1])
@@ -221,20 +222,20 @@ def _backward(pairs: Pairs, steps: list[_Step], v_image: Tensor, N: int, absgrad
     if not steps:
         return rows.new_zeros(N, len(rows))
     basis = _monomials(v_image.dtype, v_image.device)
-    workspace = _Workspace(v_image, 6)
+    workspace = _Workspace(v_image, 3 if all(step.blended for step in steps) else 5)
     behind = v_image.new_zeros(len(v_image), _PIXELS)
     later = v_image.new_ones(BLOCKS, BLOCKS).triu(1)
     for step in reversed(steps):
         T, L = step.slots.shape
         blocks = L // LAYERS
-        alpha, weight, passed = step.blended or workspace.blend(step, pairs.saturates)
+        alpha, weight, passed = step.blended or workspace.blend(step, pairs.saturates, 3)
         v_pixels = v_image[step.tiles]
 
         # With g_i the gradient along colour i and B_i that of all behind it blended, dL/dlog(alpha_i) = w_i (g_i - B_i)
         # and B_{i-1} = lerp(B_i, g_i, alpha_i), from back to front: nothing is divided by 1 - alpha. What a block sees
         # behind it is the sum of w g over all later ones, over the transmittance there; nothing more is drawn where
         # that is less than the least.
-        g, B, wg = (workspace.buffer(i, step) for i in (3, 4, 5))
+        g, B, wg = (workspace.buffer(i, step) for i in range(3))
         torch.bmm(step.columns[8:].permute(1, 2, 0), v_pixels, out=g.view(T, L, _PIXELS))
         sums = torch.mul(weight, g, out=wg).sum(1)
         after = torch.matmul(later[:blocks, :blocks], sums) + behind[step.tiles][:, None]
