@@ -74,7 +74,7 @@ class _Rasterize(torch.autograd.Function):
         views, images, alphas = [], [], []
         for view in zip(means2d, conics, opacities, colors, depths, visible, strict=True):
             pairs = Pairs.find(*view, grid)
-            values, steps = _composite(pairs, grid, keep_steps, kept_bytes)
+            values, steps = _composite(pairs, keep_steps, kept_bytes)
             images.append(grid.image(pairs.tiles, values[:, :-1]))
             alphas.append(grid.image(pairs.tiles, values[:, -1:]))
             views.append((pairs, steps))
@@ -178,7 +178,7 @@ def _batches(tiles: Tensor, counts: Tensor) -> Iterator[tuple[Tensor, int]]:
         first = last
 
 
-def _composite(pairs: Pairs, grid: Grid, keep_steps: bool, kept_bytes: int) -> tuple[Tensor, list[_Step]]:
+def _composite(pairs: Pairs, keep_steps: bool, kept_bytes: int) -> tuple[Tensor, list[_Step]]:
     """Sums of weights times colours [tiles, channels, pixels], and the steps for backward."""
     image = pairs.table.new_zeros(len(pairs.tiles), len(pairs.table) - 8, _PIXELS)
     transmittance = image.new_ones(len(image), _PIXELS)
@@ -190,7 +190,7 @@ def _composite(pairs: Pairs, grid: Grid, keep_steps: bool, kept_bytes: int) -> t
     while len(active):
         for tiles, blocks in _batches(active, counts):
             slots = pairs.slots(tiles, layer, blocks)
-            step = _Step(tiles, slots, pairs.columns(slots, tiles, grid), transmittance[tiles])
+            step = _Step(tiles, slots, pairs.columns(slots, tiles), transmittance[tiles])
             size = slots.numel() * _PIXELS
             if 2 * size <= len(kept):
                 alpha, weight = kept[: 2 * size].view(2, *step.shape, _PIXELS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -34,10 +35,11 @@ class Grid:
     def rows(self) -> int:
         return -(-self.height // TILE_HEIGHT)
 
-    def centers(self, tiles: Tensor) -> tuple[Tensor, Tensor]:
-        """x and y of the centres of some tiles, pixels."""
+    def centers(self, tiles: Tensor) -> Tensor:
+        """Centres of some tiles [2, T], pixels."""
         row = tiles // self.columns
-        return (tiles - row * self.columns) * TILE_WIDTH + TILE_WIDTH // 2, row * TILE_HEIGHT + TILE_HEIGHT // 2
+        column = tiles - row * self.columns
+        return torch.stack([column * TILE_WIDTH + TILE_WIDTH // 2, row * TILE_HEIGHT + TILE_HEIGHT // 2])
 
     def image(self, tiles: Tensor, values: Tensor) -> Tensor:
         """The image [H, W, D] of some tiles' values [T, D, pixels], zero elsewhere."""
@@ -83,6 +85,8 @@ class Pairs:
     """The first pair of each of these tiles."""
     counts: Tensor
     """Their numbers of pairs."""
+    origins: Tensor
+    """Their centres [2, tiles], pixels."""
     saturates: bool
     """Whether some opacity exceeds MAX_ALPHA."""
 
@@ -141,6 +145,7 @@ class Pairs:
             tiles=tiles,
             begins=ends.index_select(0, tiles) - counts,
             counts=counts,
+            origins=grid.centers(tiles),
             saturates=bool((opacity > MAX_ALPHA).any()),
         )
 
@@ -154,11 +159,10 @@ class Pairs:
         runs of memory.
         """
         begins = self.begins[tiles, None]
-        layers = torch.arange(layer, layer + LAYERS * blocks, device=begins.device).view(blocks, LAYERS).T.flatten()
-        slots = begins + layers
+        slots = begins + (_layers(blocks, begins.device) + layer)
         return slots.where(slots < begins + self.counts[tiles, None], len(self))
 
-    def columns(self, slots: Tensor, tiles: Tensor, grid: Grid) -> Tensor:
+    def columns(self, slots: Tensor, tiles: Tensor) -> Tensor:
         """What compositing needs of pairs [T, L] of some of `tiles` [9 + D, T, L].
 
         These are the Gaussian's centre relative to the tile's (2); log2(alpha) over the tile as a polynomial, in the
@@ -167,8 +171,7 @@ class Pairs:
         ranks = self.ranks.index_select(0, slots.flatten())
         columns = self.table.index_select(1, ranks).unflatten(1, slots.shape)
         x, y, a, cross, _, slope, rest, level = columns[:8]
-        for centre, origin in zip((x, y), grid.centers(self.tiles[tiles]), strict=True):
-            centre -= origin[:, None]
+        columns[:2] -= self.origins[:, tiles, None]
         # The factored form keeps its digits where the coefficients of the polynomial are small differences.
         u = torch.addcmul(x, slope, y)
         au, ry = a * u, rest * y
@@ -176,6 +179,12 @@ class Pairs:
         torch.mul(au, -2, out=slope)
         torch.addcmul(ry.mul_(-2), cross, u, value=-1, out=rest)
         return columns
+
+
+@functools.cache
+def _layers(blocks: int, device: torch.device) -> Tensor:
+    """The layers of some blocks [LAYERS * blocks] in the order of `Pairs.slots`."""
+    return torch.arange(LAYERS * blocks, device=device).view(blocks, LAYERS).T.flatten()
 
 
 def _span(low: Tensor, high: Tensor, count: int, size: int) -> tuple[Tensor, Tensor]:
