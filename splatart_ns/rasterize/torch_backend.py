@@ -30,8 +30,7 @@ BLOCKS = 12
 SLOTS = 8192
 """Pairs in one step."""
 KEPT_BYTES = 24 * 2**20
-"""Alphas and weights that forward keeps for backward, which composes again what is beyond. glibc keeps the pages of an
-allocation below 32 MiB for the next one; touching fresh ones costs more than to compose again."""
+"""Alphas and weights that forward keeps for backward, which composes again what is beyond."""
 MIN_TRANSMITTANCE = 1e-4
 _PIXELS = TILE_HEIGHT * TILE_WIDTH
 
@@ -68,6 +67,7 @@ def rasterize_to_pixels(
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means2d, conics, opacities, colors, depths, visible, width, height, absgrad):
+        _reuse_pages()
         grid = Grid(width, height)
         keep_steps = any(ctx.needs_input_grad[:4])
         kept_bytes = KEPT_BYTES // max(len(means2d), 1)
@@ -146,10 +146,7 @@ class _Step:
 
 
 class _Workspace:
-    """Buffers for the largest step, shared by all steps: touching fresh memory costs more than the arithmetic in it.
-
-    They are one allocation because glibc then keeps its pages from call to call; several would be given back.
-    """
+    """Buffers for the largest step, shared by all steps: they fit the caches better than fresh ones."""
 
     def __init__(self, like: Tensor, buffers: int) -> None:
         slots = max(SLOTS, LAYERS * BLOCKS)
@@ -284,6 +281,15 @@ def _absolute(coefficients: Tensor, v_log: Tensor, basis: Tensor, scratch: Tenso
         v = torch.mm(torch.stack(slope).T, basis, out=scratch.view(-1, _PIXELS))
         sums.append(v.mul_(v_log).norm(p=1, dim=-1))
     return torch.stack(sums)
+
+
+@functools.cache
+def _reuse_pages() -> None:
+    """Has glibc keep freed memory for the next call: touching fresh pages costs more than the arithmetic in them.
+
+    It keeps twice the size of the largest block that was ever freed, up to 32 MiB; nobody touches this one.
+    """
+    torch.empty(31 * 2**20, dtype=torch.uint8, device="cpu")
 
 
 @functools.cache

@@ -145,7 +145,7 @@ class Pairs:
             tiles=tiles,
             begins=ends.index_select(0, tiles) - counts,
             counts=counts,
-            origins=grid.centers(tiles),
+            origins=grid.centers(tiles).to(means2d),
             saturates=bool((opacity > MAX_ALPHA).any()),
         )
 
