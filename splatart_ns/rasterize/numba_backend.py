@@ -61,8 +61,9 @@ class _Rasterize(torch.autograd.Function):
         bins, colors, used, (C, N, D) = ctx.state
         needs = ctx.needs_input_grad[:4]
         wants = any(needs[:3]), ctx.means2d is not None, needs[3]
-        moments = np.empty((len(bins.slots) if wants[0] else 0, 8 if wants[1] else 6), np.float32)
-        pair_colors = np.empty((len(bins.slots) if wants[2] else 0, colors.shape[1]), np.float32)
+        drawn = np.empty(len(bins.pairs), bool)
+        moments = np.empty((len(bins.pairs) if wants[0] else 0, 8 if wants[1] else 6), np.float32)
+        pair_colors = np.empty((len(bins.pairs) if wants[2] else 0, colors.shape[1]), np.float32)
         bounds = balanced_bounds(np.concatenate([[0], np.cumsum(used)]), num_workers())
         run(
             composite_backward,
@@ -73,6 +74,7 @@ class _Rasterize(torch.autograd.Function):
             _array(v_render),
             _array(v_alphas),
             wants,
+            drawn,
             moments,
             pair_colors,
         )
@@ -80,7 +82,7 @@ class _Rasterize(torch.autograd.Function):
         widths = (2, 3, 1, D if wants[2] else 0, 2 if wants[1] else 0)
         gradients = [np.zeros((C * N, width), np.float32) for width in widths]
         bounds = even_bounds(len(bins.order), num_workers())
-        run(gather_gradients, bounds, bins, moments, pair_colors, wants, *gradients)
+        run(gather_gradients, bounds, bins, drawn, moments, pair_colors, wants, *gradients)
         *gradients, absolute = (torch.from_numpy(gradient).unflatten(0, (C, N)) for gradient in gradients)
         if wants[1]:
             ctx.means2d.absgrad = absolute

@@ -30,8 +30,8 @@ class Bins(NamedTuple):
     """[C tiles_y tiles_x + 1]: where the pairs of each tile start, front to back."""
     gaussians: np.ndarray
     """[E] Gaussian of each pair."""
-    slots: np.ndarray
-    """[E] slot of each pair."""
+    pairs: np.ndarray
+    """[E] pair of each slot."""
     order: np.ndarray
     """[S] Gaussians that touch a tile, by camera and then by depth."""
     slot_offsets: np.ndarray
@@ -179,7 +179,7 @@ def _offsets(tallies, sizes):
 
 
 @jit
-def _fill(begin, end, worker, order, row_offsets, rows, spans, slot_offsets, grid, places, gaussians, slots):
+def _fill(begin, end, worker, order, row_offsets, rows, spans, slot_offsets, grid, places, gaussians, pairs):
     """Lists the pairs by tile."""
     tiles_x, tiles_y, per_camera = grid
     place = places[worker]
@@ -191,7 +191,7 @@ def _fill(begin, end, worker, order, row_offsets, rows, spans, slot_offsets, gri
             base = ((g // per_camera) * tiles_y + row) * tiles_x
             for tile in range(base + spans[i, 0], base + spans[i, 1]):
                 gaussians[place[tile]] = g
-                slots[place[tile]] = slot
+                pairs[slot] = place[tile]
                 place[tile] += 1
                 slot += 1
             i += 1
@@ -222,6 +222,6 @@ def bin_gaussians(means, conics, opacities, depths, visible, cameras: int, width
     run(_spans, bounds, order, row_offsets, means, conics, ellipses, rows, size, grid, spans, tallies, sizes)
     tile_offsets, slot_offsets = _offsets(tallies, sizes)
     gaussians = np.empty(tile_offsets[-1], np.int32)
-    slots = np.empty(tile_offsets[-1], np.int32)
-    run(_fill, bounds, order, row_offsets, rows, spans, slot_offsets, grid, tallies, gaussians, slots)
-    return Bins(tiles_x, tiles_y, tile_offsets, gaussians, slots, order, slot_offsets, coefficients)
+    pairs = np.empty(tile_offsets[-1], np.int32)
+    run(_fill, bounds, order, row_offsets, rows, spans, slot_offsets, grid, tallies, gaussians, pairs)
+    return Bins(tiles_x, tiles_y, tile_offsets, gaussians, pairs, order, slot_offsets, coefficients)

@@ -139,20 +139,15 @@ def composite(begin, end, worker, bins, colors, render, alphas, depths):
 
 
 @jit
-def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alphas, wants, moments, v_colors):
-    """Gradients of the tiles begin..end's pairs, by slot.
+def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alphas, wants, drawn, moments, v_colors):
+    """Gradients of the tiles begin..end's pairs.
 
     wants: whether to fill moments, its columns for absgrad, and v_colors [E, padded D].
+    drawn [E] receives which pairs come before all pixels are saturated; the others' gradients are not filled in.
     moments [E, 6 or 8], with v the gradient of a pixel's ln(alpha) and u = dx + s dy, are the sums over the tile of v
     times 1, u, dy, u^2, u dy, dy^2, and the absolute gradients of the mean's x and y.
     """
-    tiles_x, tiles_y, tile_offsets, gaussians, slots = (
-        bins.tiles_x,
-        bins.tiles_y,
-        bins.tile_offsets,
-        bins.gaussians,
-        bins.slots,
-    )
+    tiles_x, tiles_y, tile_offsets, gaussians = bins.tiles_x, bins.tiles_y, bins.tile_offsets, bins.gaussians
     coefficients = bins.coefficients
     want_moments, want_abs, want_colors = wants
     height, width, channels = v_render.shape[1], v_render.shape[2], v_render.shape[3]
@@ -164,11 +159,8 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
         row, column = (tile // tiles_x) % tiles_y, tile % tiles_x
         left, top = column * TILE + 0.5, row * TILE + 0.5
         start, count = tile_offsets[tile], depths[tile]
-        for pair in range(start + count, tile_offsets[tile + 1]):
-            if want_moments:
-                moments[slots[pair]] = _ZERO
-            if want_colors:
-                v_colors[slots[pair]] = _ZERO
+        drawn[start : start + count] = True
+        drawn[start + count : tile_offsets[tile + 1]] = False
         if count == 0:
             continue
         _start_tile(work)
@@ -209,7 +201,8 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
                 work[_T + i * TILE + j] = v_alphas[camera, row * TILE + i, column * TILE + j, 0]
         # work[_A] holds what lies behind the pair, composited and dotted with the image gradient.
         for k in range(count - 1, -1, -1):
-            g, slot = gaussians[start + k], slots[start + k]
+            pair = start + k
+            g = gaussians[pair]
             save = saved[k]
             u0, y0, square, shear, drop, peak = _at_tile(coefficients[g], left, top)
             for p in range(PIXELS):
@@ -227,10 +220,10 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
                     v2 += weight * g2
                     v3 += weight * g3
                 if want_colors:
-                    v_colors[slot, d] = v0
-                    v_colors[slot, d + 1] = v1
-                    v_colors[slot, d + 2] = v2
-                    v_colors[slot, d + 3] = v3
+                    v_colors[pair, d] = v0
+                    v_colors[pair, d + 1] = v1
+                    v_colors[pair, d + 2] = v2
+                    v_colors[pair, d + 3] = v3
             c0, c1, c2, c3 = colors[g, 0], colors[g, 1], colors[g, 2], colors[g, 3]
             m, mu, my, muu, muy, myy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
             v0, v1, v2, v3 = _ZERO, _ZERO, _ZERO, _ZERO
@@ -256,17 +249,17 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
                 muy += vu * dy
                 myy += vy * dy
             if want_moments:
-                moments[slot, 0] = m
-                moments[slot, 1] = mu
-                moments[slot, 2] = my
-                moments[slot, 3] = muu
-                moments[slot, 4] = muy
-                moments[slot, 5] = myy
+                moments[pair, 0] = m
+                moments[pair, 1] = mu
+                moments[pair, 2] = my
+                moments[pair, 3] = muu
+                moments[pair, 4] = muy
+                moments[pair, 5] = myy
             if want_colors:
-                v_colors[slot, 0] = v0
-                v_colors[slot, 1] = v1
-                v_colors[slot, 2] = v2
-                v_colors[slot, 3] = v3
+                v_colors[pair, 0] = v0
+                v_colors[pair, 1] = v1
+                v_colors[pair, 2] = v2
+                v_colors[pair, 3] = v3
             if want_moments and want_abs:
                 ax, ay = _ZERO, _ZERO
                 for p in range(PIXELS):
@@ -275,27 +268,39 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
                     slope_x = square * (work[_X + p] + (shear * work[_Y + p] + u0))
                     ax += abs(v * slope_x)
                     ay += abs(v * (shear * slope_x + drop * dy))
-                moments[slot, 6] = ax
-                moments[slot, 7] = ay
+                moments[pair, 6] = ax
+                moments[pair, 7] = ay
 
 
 @jit
 def gather_gradients(
-    begin, end, worker, bins, moments, pair_colors, wants, v_means, v_conics, v_opacities, v_colors, absgrad
+    begin, end, worker, bins, drawn, moments, pair_colors, wants, v_means, v_conics, v_opacities, v_colors, absgrad
 ):
-    """Sums the slots of the sorted Gaussians begin..end into gradients [G, .]."""
-    order, slot_offsets, coefficients = bins.order, bins.slot_offsets, bins.coefficients
+    """Sums the pairs of the sorted Gaussians begin..end into gradients [G, .]."""
+    order, slot_offsets, pairs, coefficients = bins.order, bins.slot_offsets, bins.pairs, bins.coefficients
     want_moments, want_abs, want_colors = wants
-    total = np.empty(8)
     for k in range(begin, end):
         g = order[k]
+        m, mu, my, muu, muy, myy, ax, ay = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for slot in range(slot_offsets[k], slot_offsets[k + 1]):
+            pair = pairs[slot]
+            if not drawn[pair]:
+                continue
+            if want_moments:
+                m += moments[pair, 0]
+                mu += moments[pair, 1]
+                my += moments[pair, 2]
+                muu += moments[pair, 3]
+                muy += moments[pair, 4]
+                myy += moments[pair, 5]
+                if want_abs:
+                    ax += moments[pair, 6]
+                    ay += moments[pair, 7]
+            if want_colors:
+                for d in range(v_colors.shape[1]):
+                    v_colors[g, d] += pair_colors[pair, d]
         if want_moments:
-            total[:] = 0.0
-            for slot in range(slot_offsets[k], slot_offsets[k + 1]):
-                for i in range(moments.shape[1]):
-                    total[i] += moments[slot, i]
             _, _, f, s, h, peak = coefficients[g]
-            m, mu, my, muu, muy, myy, ax, ay = total
             # log2(alpha) carries log2(e) times the exponent -q / 2, of which the conic's entries are half a derivative.
             v_means[g, 0] = -2 * _LN_2 * f * mu
             v_means[g, 1] = -2 * _LN_2 * (s * f * mu + h * my)
@@ -306,7 +311,3 @@ def gather_gradients(
             if want_abs:
                 absgrad[g, 0] = 2 * _LN_2 * ax
                 absgrad[g, 1] = 2 * _LN_2 * ay
-        if want_colors:
-            for slot in range(slot_offsets[k], slot_offsets[k + 1]):
-                for d in range(v_colors.shape[1]):
-                    v_colors[g, d] += pair_colors[slot, d]

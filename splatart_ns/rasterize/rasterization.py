@@ -100,7 +100,8 @@ def rasterization(
             (accumulated over alpha), or colours then depth.
         absgrad: Let backward set `info["means2d"].absgrad`.
         rasterize_mode: "antialiased" keeps the mass of Gaussians that `eps2d` blurs (Mip-Splatting).
-        packed, tile_size, sparse_grad, channel_chunk: Ignored; results are never packed.
+        packed, sparse_grad, channel_chunk: Ignored; results are never packed.
+        tile_size: Only passed on to `info`; the backends have tiles of their own.
         distributed, camera_model, covars: Only gsplat's defaults are supported.
         backend: "gsplat" (CUDA), "numba" (CPU, float32), "torch" (any device), or "auto": what `set_backend` chose or
             the first of these for the device of `means`; torch for anything but float32.
@@ -176,9 +177,9 @@ def rasterization(
         "width": width,
         "height": height,
         "n_cameras": C,
-        "tile_size": torch_backend.TILE,
-        "tile_width": -(-width // torch_backend.TILE),
-        "tile_height": -(-height // torch_backend.TILE),
+        "tile_size": tile_size,
+        "tile_width": -(-width // tile_size),
+        "tile_height": -(-height // tile_size),
     }
     return image, alphas, info
 

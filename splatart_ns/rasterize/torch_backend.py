@@ -1,10 +1,10 @@
 """Alpha compositing of 2D Gaussians in plain torch: any device with float64, any float type, any number of channels.
 
-The image is cut into tiles of 8x8 pixels, and every tile walks its own Gaussians from front to back, `LAYERS` at a
-time and many tiles at once. Over a tile the logarithm of a Gaussian's alpha is a quadratic polynomial of the pixel,
-so one matrix product with the six monomials gives all exponents, and another one takes all gradients of the geometry
-back as the six moments of the gradient image. Backward recomputes what forward composed: that is cheaper than
-touching fresh memory.
+The image is cut into tiles of 8x4 pixels, and every tile walks its own Gaussians from front to back, many layers of
+many tiles at once. Over a tile the logarithm of a Gaussian's alpha is a quadratic polynomial of the pixel, so one
+matrix product with the six monomials gives all exponents, and another one takes all gradients of the geometry back as
+the six moments of the gradient image. What runs along a ray runs in two levels, layer after layer within blocks of
+`LAYERS` and then over the blocks, so that no operation is small.
 
 Compositing follows gsplat: alpha is at most 0.999, alphas below 1/255 are skipped, and a pixel stops before the
 Gaussian that would take its transmittance to 1e-4 or less. Unlike gsplat 1.4.0, whose Gaussians end at three
@@ -13,22 +13,26 @@ standard deviations, a Gaussian ends exactly where its alpha falls below 1/255.
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import pad, threshold_
+from torch.nn.functional import embedding_bag, threshold_
 
-TILE = 8
-LAYERS = 24
-TILES_PER_STEP = 512
-MAX_ALPHA = 0.999
-MIN_ALPHA = 1 / 255
+from splatart_ns.rasterize.torch_binning import LAYERS, MAX_ALPHA, MIN_ALPHA, TILE_HEIGHT, TILE_WIDTH, Grid, Pairs
+
+BLOCKS = 12
+"""Most blocks of LAYERS pairs that a tile walks before tiles that are opaque are left."""
+SLOTS = 8192
+"""Pairs in one step."""
+KEPT_BYTES = 24 * 2**20
+"""Alphas and weights that forward keeps for backward, which composes again what is beyond."""
 MIN_TRANSMITTANCE = 1e-4
-_PIXELS = TILE * TILE
-_FAR_BELOW = -1e4  # exponent of the empty slots: exp2 gives exactly 0
+_PIXELS = TILE_HEIGHT * TILE_WIDTH
 
 
 def rasterize_to_pixels(
@@ -63,317 +67,234 @@ def rasterize_to_pixels(
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means2d, conics, opacities, colors, depths, visible, width, height, absgrad):
+        _reuse_pages()
+        grid = Grid(width, height)
         keep_steps = any(ctx.needs_input_grad[:4])
-        views, images = [], []
+        kept_bytes = KEPT_BYTES // max(len(means2d), 1)
+        views, images, alphas = [], [], []
         for view in zip(means2d, conics, opacities, colors, depths, visible, strict=True):
-            *geometry, color, depth, mask = view
-            pairs = _Pairs.find(*geometry, depth, mask, width, height)
-            tiles, steps = _composite(pairs, _with_ones(color), keep_steps)
-            images.append(_untile(tiles, width, height))
+            pairs = Pairs.find(*view, grid)
+            values, steps = _composite(pairs, keep_steps, kept_bytes)
+            images.append(grid.image(pairs.tiles, values[:, :-1]))
+            alphas.append(grid.image(pairs.tiles, values[:, -1:]))
             views.append((pairs, steps))
-        ctx.save_for_backward(means2d, conics, opacities, colors)
-        ctx.views, ctx.absgrad = views, absgrad
-        image = torch.stack(images)
-        return image[..., :-1].contiguous(), image[..., -1:].contiguous()
+        ctx.save_for_backward(means2d, opacities)
+        ctx.grid, ctx.views, ctx.absgrad = grid, views, absgrad
+        return torch.stack(images), torch.stack(alphas)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_image, v_alpha):
-        means2d, _, opacities, colors = ctx.saved_tensors
-        D = colors.shape[-1]
+        means2d, opacities = ctx.saved_tensors
+        N, D = opacities.shape[1], v_image.shape[-1]
         gradients = []
         for c, (pairs, steps) in enumerate(ctx.views):
-            v_tiles = _tile(torch.cat([v_image[c], v_alpha[c]], -1))
-            gradients.append(_backward(pairs, steps, _with_ones(colors[c]), v_tiles, ctx.absgrad))
+            v_values = torch.cat([ctx.grid.values(pairs.tiles, v[c]) for v in (v_image, v_alpha)], 1)
+            gradients.append(_backward(pairs, steps, v_values, N, ctx.absgrad))
         moments = torch.stack(gradients)
-        v_colors = moments[..., 6 : 6 + D]
         v_conics = moments[..., :3] * moments.new_tensor([-0.5, -1.0, -0.5])
         v_log = moments[..., 5]
         v_opacities = (v_log / opacities).where(v_log != 0, 0.0)  # what is not drawn may have any opacity, even 0
         if ctx.absgrad:
             means2d.absgrad = moments[..., 7 + D :]
-        return moments[..., 3:5], v_conics, v_opacities, v_colors, None, None, None, None, None
-
-
-@dataclass
-class _Pairs:
-    """The M (tile, Gaussian) pairs of one view, tile after tile, near to far within a tile."""
-
-    gaussians: Tensor
-    """Index of the Gaussian [M + 1]; the last pair stands for an empty slot and draws nothing."""
-    centers: Tensor
-    """The Gaussian's centre relative to the tile's [2, M], pixels."""
-    coefficients: Tensor
-    """log2(alpha) over the tile as a polynomial [6, M + 1], in the order of `_monomials`."""
-    starts: Tensor
-    """First pair of every tile, and M [tiles + 1]."""
-    saturates: bool
-    """Whether some opacity exceeds MAX_ALPHA."""
-
-    @staticmethod
-    def find(means2d, conics, opacities, depths, visible, width, height) -> _Pairs:
-        columns, rows = -(-width // TILE), -(-height // TILE)
-        ids = (visible & (opacities >= MIN_ALPHA)).nonzero()[:, 0]
-        ids = ids.index_select(0, _stable_argsort(depths.index_select(0, ids)))
-
-        # q(x, y) = a (x + slope y)^2 + rest y^2, in float64 (which MPS lacks) because rest cancels for needles.
-        # Alpha >= 1/255 where q <= reach; the slack makes culling err on the safe side.
-        wide = means2d.dtype if means2d.device.type == "mps" else torch.float64
-        a, b, c = conics.index_select(0, ids).to(wide).unbind(-1)
-        mx, my = means2d.index_select(0, ids).to(wide).unbind(-1)
-        opacity = opacities.index_select(0, ids).to(wide)
-        slope = b / a
-        rest = (c - b * slope).clamp_min(1e-12)
-        reach = (1 + 1e-4) * 2 * (255 * opacity).log() + 1e-4
-
-        # One entry per Gaussian and row of tiles that it touches, then per tile: the ellipse's edges within the row
-        # are extremal at +-tip, or where the row ends.
-        half = (reach / rest).sqrt()
-        tip = slope * (reach / (rest * (rest / a + slope.square()))).sqrt()
-        index, row = _expand(*_span(my - half, my + half, rows))
-        tip, slope_, x, low, width2, ratio = (
-            v.to(means2d).index_select(0, index) for v in (tip, slope, mx, my - 0.5, reach / a, rest / a)
-        )
-        low = row * TILE - low
-        high = low + (TILE - 1)
-        left, right = (
-            x - slope_ * y + side * (width2 - ratio * y * y).clamp_min(0).sqrt()
-            for side, y in ((-1, tip.clamp(low, high)), (1, tip.neg().clamp(low, high)))
-        )
-        entry, column = _expand(*_span(left, right, columns))
-
-        # Ranks are in depth order, so sorting (tile, rank) sorts each tile near to far.
-        bits = len(ids).bit_length()
-        keys = _sort(((row * columns << bits) + index).index_select(0, entry) + (column << bits))
-        tile, rank = keys >> bits, keys & ((1 << bits) - 1)
-        counts = torch.bincount(tile, minlength=rows * columns)
-
-        # log2(alpha) over the tile, expanded about the tile's centre from the factored form, which keeps its digits.
-        scale = -0.5 * math.log2(math.e)
-        a, cross, c, slope, rest, level, mx, my = (
-            v.to(means2d).index_select(0, rank)
-            for v in (scale * a, 2 * scale * b, scale * c, slope, scale * rest, opacity.log2(), mx, my)
-        )
-        row = tile // columns
-        x = mx - ((tile - row * columns) * TILE + TILE // 2)
-        y = my - (row * TILE + TILE // 2)
-        u = x + slope * y
-        au, ry = a * u, rest * y
-        coefficients = torch.stack([a, cross, c, -2 * au, -cross * u - 2 * ry, au * u + ry * y + level])
-        empty = coefficients.new_tensor([0, 0, 0, 0, 0, _FAR_BELOW])
-        return _Pairs(
-            gaussians=torch.cat([ids.index_select(0, rank), ids[:1]]),
-            centers=torch.stack([x, y]),
-            coefficients=torch.cat([coefficients, empty[:, None]], 1),
-            starts=pad(counts.cumsum(0), (1, 0)),
-            saturates=bool((opacity > MAX_ALPHA).any()),
-        )
-
-    def __len__(self) -> int:
-        return self.centers.shape[1]
-
-    def slots(self, tiles: Tensor, layer: int) -> Tensor:
-        """Pairs in the next LAYERS layers of some tiles [T * LAYERS], M where a tile has no more."""
-        first, end = self.starts[tiles] + layer, self.starts[tiles + 1]
-        index = first[:, None] + torch.arange(LAYERS, device=tiles.device)
-        return index.where(index < end[:, None], len(self)).flatten()
+        return moments[..., 3:5], v_conics, v_opacities, moments[..., 6 : 6 + D], None, None, None, None, None
 
 
 @dataclass
 class _Step:
-    """What backward needs of one step of the forward pass."""
+    """Some layers of some tiles, and what backward needs of them."""
 
     tiles: Tensor
-    """Indices of the tiles [T]."""
+    """Which of the pairs' tiles [T]."""
     slots: Tensor
-    """Their pairs [T * LAYERS]."""
-    transmittance: Tensor
-    """Transmittance in front of the step [T, 64]."""
-    stops: bool
-    """Whether some pixel reaches its last Gaussian in this step."""
+    """Their pairs [T, L], L = LAYERS * blocks."""
+    columns: Tensor
+    """See `Pairs.columns`."""
+    incoming: Tensor
+    """Transmittance in front of the step [T, pixels]."""
+    stops: bool | None = None
+    """Whether some pixel reaches its last Gaussian in this step; unknown before it is composed."""
+    blended: tuple[Tensor, Tensor, Tensor] | None = None
+    """What `blend` gave, where it is kept."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return len(self.slots), LAYERS, self.slots.shape[1] // LAYERS
+
+    def blend(self, saturates: bool, alpha: Tensor, weight: Tensor, front: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Fills in alphas and weights [T, LAYERS, blocks, pixels]; returns them and what passes [T, blocks, pixels].
+
+        front: Scratch [T, LAYERS + 1, blocks, pixels], for the transmittances.
+        """
+        basis = _monomials(alpha.dtype, alpha.device)
+        torch.mm(self.columns[2:8].flatten(1).T, basis, out=alpha.view(-1, _PIXELS))
+        threshold_(alpha.exp2_(), MIN_ALPHA, 0.0)
+        if saturates:
+            alpha.clamp_max_(MAX_ALPHA)
+        layers = front.unbind(1)
+        layers[0].fill_(1)
+        for i, a in enumerate(alpha.unbind(1)):
+            torch.addcmul(layers[i], layers[i], a, value=-1, out=layers[i + 1])
+        passed = torch.cat([self.incoming[:, None], layers[-1]], 1).cumprod(1)
+        front.mul_(passed[:, None, :-1])
+        if self.stops is None:
+            self.stops = bool(passed[:, -1].amin() <= MIN_TRANSMITTANCE)
+        if self.stops:
+            alpha.mul_(torch.gt(front[:, 1:], MIN_TRANSMITTANCE, out=weight))
+        torch.mul(alpha, front[:, :-1], out=weight)
+        return alpha, weight, passed[:, 1:]
 
 
 class _Workspace:
-    """Buffers for the largest step, shared by all steps: touching fresh memory costs more than the arithmetic in it.
+    """Buffers for the largest step, shared by all steps: they fit the caches better than fresh ones."""
 
-    They are one allocation because glibc then keeps its pages from call to call; several would be given back.
-    """
+    def __init__(self, like: Tensor, buffers: int) -> None:
+        slots = max(SLOTS, LAYERS * BLOCKS)
+        self.memory = like.new_empty(buffers, (slots + slots // LAYERS) * _PIXELS)
 
-    def __init__(self, pairs: _Pairs, tiles: int, buffers: int) -> None:
-        self.basis = _monomials(pairs.coefficients)
-        self.memory = self.basis.new_empty(buffers + 1, tiles * (LAYERS + 1) * _PIXELS)
+    def buffer(self, i: int, step: _Step, more: int = 0) -> Tensor:
+        """View of a buffer [T, LAYERS + more, blocks, pixels]."""
+        T, layers, blocks = step.shape
+        shape = T, layers + more, blocks, _PIXELS
+        return self.memory[i, : math.prod(shape)].view(shape)
 
-    def layer(self, buffer: int, tiles: int, layers: int = LAYERS) -> Tensor:
-        """View of a buffer [T, layers, 64]."""
-        return self.memory[buffer, : tiles * layers * _PIXELS].view(tiles, layers, _PIXELS)
-
-    def blend(self, pairs: _Pairs, slots: Tensor, incoming: Tensor, stops: bool | None):
-        """Alphas and weights [T, LAYERS, 64], the transmittance behind [T, 64], and whether some pixel stops here."""
-        tiles = len(incoming)
-        alpha, weight = self.layer(0, tiles), self.layer(1, tiles)
-        T = self.layer(-1, tiles, LAYERS + 1)
-        torch.mm(pairs.coefficients.index_select(1, slots).T, self.basis, out=alpha.view(-1, _PIXELS))
-        threshold_(alpha.exp2_(), MIN_ALPHA, 0.0)
-        if pairs.saturates:
-            alpha.clamp_max_(MAX_ALPHA)
-        T[:, 0] = incoming
-        layers = T.unbind(1)
-        for layer, a in enumerate(alpha.unbind(1)):
-            torch.addcmul(layers[layer], layers[layer], a, value=-1, out=layers[layer + 1])
-        torch.mul(alpha, T[:, :-1], out=weight)
-        outgoing = layers[-1].clone()
-        if stops is None:
-            stops = bool(outgoing.amin() <= MIN_TRANSMITTANCE)
-        if stops:
-            drawn = T[:, 1:].gt_(MIN_TRANSMITTANCE)
-            weight.mul_(drawn)
-            alpha.mul_(drawn)
-        return alpha, weight, outgoing, stops
+    def blend(self, step: _Step, saturates: bool, first: int) -> tuple[Tensor, Tensor, Tensor]:
+        """`step.blend` in the buffers `first` and the next, with the first of all as scratch."""
+        alpha, weight = (self.buffer(i, step) for i in (first, first + 1))
+        return step.blend(saturates, alpha, weight, self.buffer(0, step, 1))
 
 
-def _composite(pairs: _Pairs, colors: Tensor, keep_steps: bool) -> tuple[Tensor, list[_Step]]:
-    """Sums of weights times colours [tiles, channels, 64], and the steps for backward."""
-    counts = pairs.starts.diff()
-    image = colors.new_zeros(len(counts), colors.shape[-1], _PIXELS)
-    transmittance = colors.new_ones(len(counts), _PIXELS)
-    active = counts.nonzero()[:, 0]
-    workspace = _Workspace(pairs, min(len(active), TILES_PER_STEP), 2)
+def _batches(tiles: Tensor, counts: Tensor) -> Iterator[tuple[Tensor, int]]:
+    """Tiles for one step each, and the blocks they need; counts of the pairs they have left, descending."""
+    blocks_needed = counts.add(LAYERS - 1).div(LAYERS, rounding_mode="floor").clamp_max(BLOCKS).tolist()
+    first = 0
+    while first < len(tiles):
+        blocks = blocks_needed[first]
+        last = first + max(SLOTS // (LAYERS * blocks), 1)
+        yield tiles[first:last], blocks
+        first = last
+
+
+def _composite(pairs: Pairs, keep_steps: bool, kept_bytes: int) -> tuple[Tensor, list[_Step]]:
+    """Sums of weights times colours [tiles, channels, pixels], and the steps for backward."""
+    image = pairs.table.new_zeros(len(pairs.tiles), len(pairs.table) - 8, _PIXELS)
+    transmittance = image.new_ones(len(image), _PIXELS)
+    workspace = _Workspace(image, 3)
+    room = 2 * _PIXELS * (len(pairs) + 2 * LAYERS * len(image))
+    kept = image.new_empty(min(room, kept_bytes // image.element_size()) if keep_steps else 0)
+    active, counts = torch.arange(len(image), device=image.device), pairs.counts
     steps, layer = [], 0
     while len(active):
-        for tiles in active.split(TILES_PER_STEP):
-            slots = pairs.slots(tiles, layer)
-            incoming = transmittance[tiles]
-            _, weight, outgoing, stops = workspace.blend(pairs, slots, incoming, None)
-            color = colors.index_select(0, pairs.gaussians.index_select(0, slots)).view(len(tiles), LAYERS, -1)
-            image.index_add_(0, tiles, torch.bmm(color.transpose(1, 2), weight))
-            transmittance[tiles] = outgoing
+        for tiles, blocks in _batches(active, counts):
+            slots = pairs.slots(tiles, layer, blocks)
+            step = _Step(tiles, slots, pairs.columns(slots, tiles), transmittance[tiles])
+            size = slots.numel() * _PIXELS
+            if 2 * size <= len(kept):
+                alpha, weight = kept[: 2 * size].view(2, *step.shape, _PIXELS)
+                kept = kept[2 * size :]
+                blended = step.blended = step.blend(pairs.saturates, alpha, weight, workspace.buffer(0, step, 1))
+            else:
+                blended = workspace.blend(step, pairs.saturates, 1)
+            _, weight, passed = blended
+            image.index_add_(0, tiles, torch.bmm(step.columns[8:].transpose(0, 1), weight.flatten(1, 2)))
+            transmittance.index_copy_(0, tiles, passed[:, -1])
             if keep_steps:
-                steps.append(_Step(tiles, slots, incoming, stops))
-        layer += LAYERS
-        unfinished = (counts[active] > layer) & (transmittance[active].amax(-1) > MIN_TRANSMITTANCE)
-        active = active[unfinished]
+                steps.append(step)
+        layer += LAYERS * BLOCKS
+        counts = counts - LAYERS * BLOCKS
+        unfinished = (counts > 0) & (transmittance[active].amax(-1) > MIN_TRANSMITTANCE)
+        active, counts = active[unfinished], counts[unfinished]
     return image, steps
 
 
-def _backward(pairs: _Pairs, steps: list[_Step], colors: Tensor, v_image: Tensor, absgrad: bool) -> Tensor:
-    """Gradients of the Gaussians [N, 6 + channels (+ 2)].
+def _backward(pairs: Pairs, steps: list[_Step], v_image: Tensor, N: int, absgrad: bool) -> Tensor:
+    """Gradients of N Gaussians [N, 6 + channels (+ 2)], given those of the tiles [tiles, channels, pixels].
 
     Columns: the second moments of the gradient of log(alpha) about the centre (xx, xy, yy), the gradient of the centre,
     the zeroth moment; the gradients of the colours; the absolute gradients of the centre.
     """
-    channels = colors.shape[-1]
-    rows = colors.new_zeros(len(pairs) + 1, 6 + channels + 2 * absgrad)
-    workspace = _Workspace(pairs, max((len(s.tiles) for s in steps), default=0), 4)
-    moment_basis = pad(workspace.basis.T, (0, 10)).contiguous()  # 16 columns are twice as fast as 6
-    behind = colors.new_zeros(len(v_image), _PIXELS)
+    channels = v_image.shape[1]
+    end = sum(step.slots.numel() for step in steps)
+    rows = v_image.new_zeros(6 + channels + 2 * absgrad, end + 1)  # the last one is of the pairs that no step holds
+    if not steps:
+        return rows.new_zeros(N, len(rows))
+    basis = _monomials(v_image.dtype, v_image.device)
+    workspace = _Workspace(v_image, 3 if all(step.blended for step in steps) else 5)
+    behind = v_image.new_zeros(len(v_image), _PIXELS)
+    later = v_image.new_ones(BLOCKS, BLOCKS).triu(1)
     for step in reversed(steps):
-        count = len(step.tiles)
-        alpha, weight, _, _ = workspace.blend(pairs, step.slots, step.transmittance, step.stops)
-        color = colors.index_select(0, pairs.gaussians.index_select(0, step.slots)).view(count, LAYERS, channels)
+        T, L = step.slots.shape
+        blocks = L // LAYERS
+        alpha, weight, passed = step.blended or workspace.blend(step, pairs.saturates, 3)
         v_pixels = v_image[step.tiles]
 
         # With g_i the gradient along colour i and B_i that of all behind it blended, dL/dlog(alpha_i) = w_i (g_i - B_i)
-        # and B_{i-1} = lerp(B_i, g_i, alpha_i), from back to front: nothing is divided by 1 - alpha.
-        g = torch.bmm(color, v_pixels, out=workspace.layer(2, count))
-        B = workspace.layer(3, count)
-        B[:, -1] = behind[step.tiles]
+        # and B_{i-1} = lerp(B_i, g_i, alpha_i), from back to front: nothing is divided by 1 - alpha. What a block sees
+        # behind it is the sum of w g over all later ones, over the transmittance there; nothing more is drawn where
+        # that is less than the least.
+        g, B, wg = (workspace.buffer(i, step) for i in range(3))
+        torch.bmm(step.columns[8:].permute(1, 2, 0), v_pixels, out=g.view(T, L, _PIXELS))
+        sums = torch.mul(weight, g, out=wg).sum(1)
+        after = torch.matmul(later[:blocks, :blocks], sums) + behind[step.tiles][:, None]
+        behind.index_copy_(0, step.tiles, after[:, 0] + sums[:, 0])
+        torch.div(after, passed.clamp_min(MIN_TRANSMITTANCE), out=B[:, -1])
         B_, g_, alpha_ = B.unbind(1), g.unbind(1), alpha.unbind(1)
         for i in range(LAYERS - 1, 0, -1):
             torch.lerp(B_[i], g_[i], alpha_[i], out=B_[i - 1])
-        behind[step.tiles] = torch.lerp(B_[0], g_[0], alpha_[0])
-        v_color = torch.bmm(weight, v_pixels.transpose(1, 2)).view(-1, channels)
-        v_log = g.sub_(B).mul_(weight)
+        v_log = wg.addcmul_(weight, B, value=-1)
         if pairs.saturates:
-            v_log.mul_(alpha.lt_(MAX_ALPHA))
+            v_log.mul_(torch.lt(alpha, MAX_ALPHA, out=g))
         v_log = v_log.view(-1, _PIXELS)
-        parts = [torch.mm(v_log, moment_basis)[:, :6], v_color]
+        start = end - T * L
+        torch.mm(basis, v_log.T, out=rows[:6, start:end])
+        v_color = torch.bmm(v_pixels, weight.flatten(1, 2).transpose(1, 2))
+        rows[6 : 6 + channels, start:end].view(channels, T, L).copy_(v_color.transpose(0, 1))
         if absgrad:
-            parts += _absolute(pairs.coefficients.index_select(1, step.slots), v_log, workspace.basis[3:], B)
-        rows.index_copy_(0, step.slots, torch.cat(parts, -1))
+            rows[6 + channels :, start:end] = _absolute(step.columns[2:8].flatten(1), v_log, basis[3:], B)
+        end = start
 
     # From moments about the tile's centre to the Gaussian's own.
-    xx, xy, yy, x, y, one = rows[:-1, :6].T.contiguous()
-    cx, cy = pairs.centers
-    a, cross, c, lx, ly, _ = math.log(2) * pairs.coefficients[:, :-1]
-    x_, y_ = x - cx * one, y - cy * one
-    rows[:-1, :5] = torch.stack(
-        [
-            xx - cx * (x + x_),
-            xy - cx * y - cy * x_,
-            yy - cy * (y + y_),
-            -(2 * a * x + cross * y + lx * one),
-            -(cross * x + 2 * c * y + ly * one),
-        ]
-    ).T
-    return colors.new_zeros(len(colors), rows.shape[1]).index_add_(0, pairs.gaussians[: len(pairs)], rows[:-1])
+    xx, xy, yy, x, y, one = rows[:6, :-1]
+    cx, cy, a, cross, c, lx, ly = torch.cat([step.columns[:7].flatten(1) for step in steps], 1)
+    x_, y_ = torch.addcmul(x, cx, one, value=-1), torch.addcmul(y, cy, one, value=-1)
+    xx.addcmul_(cx, x + x_, value=-1)
+    xy.addcmul_(cx, y, value=-1).addcmul_(cy, x_, value=-1)
+    yy.addcmul_(cy, y + y_, value=-1)
+    v_x = (lx * one).addcmul_(a, x, value=2).addcmul_(cross, y)
+    v_y = (ly * one).addcmul_(c, y, value=2).addcmul_(cross, x)
+    torch.mul(v_x, -math.log(2), out=x)
+    torch.mul(v_y, -math.log(2), out=y)
+
+    slots = torch.cat([step.slots.flatten() for step in steps])
+    last = len(slots)
+    places = slots.new_full((len(pairs) + 1,), last)
+    places.scatter_(0, pairs.order.index_select(0, slots), torch.arange(last, device=slots.device))
+    sums = embedding_bag(places[:-1], rows.T.contiguous(), pairs.starts, mode="sum")
+    return rows.new_zeros(N, len(rows)).index_copy_(0, pairs.ids, sums)
 
 
-def _absolute(coefficients: Tensor, v_log: Tensor, basis: Tensor, scratch: Tensor) -> list[Tensor]:
-    """Sums over pixels [M, 1] of |dL/dx| and |dL/dy| of the centres; `basis` holds x, y, 1."""
+def _absolute(coefficients: Tensor, v_log: Tensor, basis: Tensor, scratch: Tensor) -> Tensor:
+    """Sums over pixels [2, M] of |dL/dx| and |dL/dy| of the centres; `basis` holds x, y, 1."""
     a, cross, c, lx, ly, _ = math.log(2) * coefficients
     sums = []
     for slope in ([2 * a, cross, lx], [cross, 2 * c, ly]):
         v = torch.mm(torch.stack(slope).T, basis, out=scratch.view(-1, _PIXELS))
-        sums.append(v.mul_(v_log).norm(p=1, dim=-1, keepdim=True))
-    return sums
+        sums.append(v.mul_(v_log).norm(p=1, dim=-1))
+    return torch.stack(sums)
 
 
-def _span(low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """First tile of `count` with a pixel centre in [low, high], and the number of such tiles (0 when none)."""
-    first = ((low - (TILE - 0.5)) / TILE).ceil().clamp(0, count)
-    last = ((high - 0.5) / TILE).floor().clamp(-1, count - 1)
-    return first.long(), (last - first + 1).clamp_min(0).long()
+@functools.cache
+def _reuse_pages() -> None:
+    """Has glibc keep freed memory for the next call: touching fresh pages costs more than the arithmetic in them.
+
+    It keeps twice the size of the largest block that was ever freed, up to 32 MiB; nobody touches this one.
+    """
+    torch.empty(31 * 2**20, dtype=torch.uint8, device="cpu")
 
 
-def _expand(first: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """For ranges first .. first + count - 1: the index of the range, and the value, of every element."""
-    ends = counts.cumsum(0)
-    index = torch.repeat_interleave(counts)
-    offset = first - ends + counts
-    return index, torch.arange(len(index), device=index.device) + offset.index_select(0, index)
-
-
-def _stable_argsort(values: Tensor) -> Tensor:
-    if values.dtype != torch.float32:
-        return values.argsort(stable=True)
-    # Sorting (value, index) as one integer is several times faster on a CPU. The bits of a float order like the float,
-    # the negative ones backwards.
-    bits = (values + 0.0).view(torch.int32)
-    bits = bits ^ (bits >> 31 & 0x7FFFFFFF)
-    return _sort((bits.long() << 32) + torch.arange(len(bits), device=bits.device)) & 0xFFFFFFFF
-
-
-def _sort(keys: Tensor) -> Tensor:
-    """Sorted keys; numpy is faster than torch on a CPU."""
-    if keys.device.type != "cpu":
-        return keys.sort().values
-    keys.numpy().sort()
-    return keys
-
-
-def _monomials(like: Tensor) -> Tensor:
-    """x^2, x y, y^2, x, y and 1 at the pixels of a tile about its centre [6, 64]."""
-    offsets = torch.arange(TILE, dtype=like.dtype, device=like.device) - (TILE - 1) / 2
-    y, x = (grid.flatten() for grid in torch.meshgrid(offsets, offsets, indexing="ij"))
+@functools.cache
+def _monomials(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """x^2, x y, y^2, x, y and 1 at the pixels of a tile about its centre [6, pixels]."""
+    sides = (torch.arange(size, dtype=dtype, device=device) - (size - 1) / 2 for size in (TILE_HEIGHT, TILE_WIDTH))
+    y, x = (grid.flatten() for grid in torch.meshgrid(*sides, indexing="ij"))
     return torch.stack([x * x, x * y, y * y, x, y, torch.ones_like(x)])
-
-
-def _with_ones(colors: Tensor) -> Tensor:
-    """Colours with one channel more, which composites to alpha."""
-    return pad(colors, (0, 1), value=1.0)
-
-
-def _untile(tiles: Tensor, width: int, height: int) -> Tensor:
-    """Tiles [tiles, channels, 64] as an image [H, W, channels]."""
-    columns, rows = -(-width // TILE), -(-height // TILE)
-    image = tiles.view(rows, columns, -1, TILE, TILE).permute(0, 3, 1, 4, 2)
-    return image.reshape(rows * TILE, columns * TILE, -1)[:height, :width]
-
-
-def _tile(image: Tensor) -> Tensor:
-    """The inverse of `_untile`, zero outside the image."""
-    height, width, channels = image.shape
-    image = pad(image, (0, 0, 0, -width % TILE, 0, -height % TILE))
-    rows, columns = image.shape[0] // TILE, image.shape[1] // TILE
-    tiles = image.view(rows, TILE, columns, TILE, channels).permute(0, 2, 4, 1, 3)
-    return tiles.reshape(rows * columns, channels, _PIXELS)

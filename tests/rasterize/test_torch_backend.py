@@ -127,10 +127,11 @@ def test_absgrad_sums_absolute_gradients_of_single_pixels():
     assert (means2d.grad.abs() <= means2d.absgrad + 1e-12).all()
 
 
-def test_steps_of_few_tiles_change_nothing(monkeypatch):
+@pytest.mark.parametrize("limit, value", [("SLOTS", 48), ("BLOCKS", 1), ("KEPT_BYTES", 0), ("KEPT_BYTES", 200_000)])
+def test_the_size_of_steps_and_what_is_kept_of_them_change_nothing(monkeypatch, limit, value):
     s = scene(N=300, width=40, height=40)
     expected, expected_gradients = image_and_gradients(rasterize_to_pixels, s, torch.float64)
-    monkeypatch.setattr(torch_backend, "TILES_PER_STEP", 3)
+    monkeypatch.setattr(torch_backend, limit, value)
     image, gradients = image_and_gradients(rasterize_to_pixels, s, torch.float64)
     torch.testing.assert_close(image, expected, rtol=0, atol=1e-14)
     torch.testing.assert_close(gradients, expected_gradients)
