@@ -66,6 +66,9 @@ class Fitting:
         return [check, *semantic, pose, joint, *exports, summary]
 
     def run(self, stage: str, work: Work) -> tuple[dict[str, Any], Sequence[str]]:
+        from splatart_ns.plugin.imports import import_less
+
+        import_less()
         import torch
 
         from splatart_ns.rasterize.rasterization import set_backend

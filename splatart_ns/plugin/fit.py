@@ -29,8 +29,9 @@ from splatart_ns.files import write_json
 from splatart_ns.method_configs.joint import method as joint_method
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.method_configs.semantic import method as semantic_method
+from splatart_ns.plugin.companion import Companions, Outcome
 from splatart_ns.plugin.semantic import RefineCameras
-from splatart_ns.plugin.stage_run import Outcome, num_processes, run_side_by_side, run_stage
+from splatart_ns.plugin.stage_run import num_processes, run_side_by_side, run_stage
 from splatart_ns.rasterize.rasterization import Backend, default_backend, set_backend
 from splatart_ns.stages.joint_constraint import parse_constraints
 
@@ -160,8 +161,11 @@ def fit(
     joints: tuple[str, ...] = (),
     worlds: Worlds | None = None,
     refine_cameras: RefineCameras = "auto",
+    companions: Companions | None = None,
 ) -> Path:
     """Run what is missing of all stages and leave the bundle in `output_dir`.
+
+    `companions` may have been started before this module was imported, which takes them as long as this process.
 
     Raises:
         InputError: for a capture, a root, a joint, a folder or a rasterizer that cannot be used.
@@ -182,7 +186,7 @@ def fit(
     configs = stage_configs(capture, output_dir, settings)
     pose, joint = (configs.pop(name) for name in ("pose", "joint"))
     with _progress() as progress:
-        _train(configs, rasterizer, report, progress)
+        _train(configs, rasterizer, report, progress, companions or Companions())
         _train({"pose": pose}, rasterizer, report, progress)
         _train({"joint": joint}, rasterizer, report, progress, whole=_is_whole(output_dir))
     return output_dir
@@ -291,7 +295,12 @@ def _is_whole(bundle: Path) -> bool:
 
 
 def _train(
-    stages: dict[str, TrainerConfig], rasterizer: Backend, report: Report, progress: Progress, whole: bool = True
+    stages: dict[str, TrainerConfig],
+    rasterizer: Backend,
+    report: Report,
+    progress: Progress,
+    companions: Companions | None = None,
+    whole: bool = True,
 ) -> None:
     """Train stages that do not need each other, but those that are done and whose results are `whole`."""
     missing: dict[str, TrainerConfig] = {}
@@ -310,13 +319,12 @@ def _train(
         progress.update(tasks[index], completed=steps)
 
     runs = list(missing.values())
-    processes = num_processes(
-        len(stages)
-    )  # of all stages: a fit that goes on has the results of one that was not ended
+    # Of all stages: a fit that goes on has the results of one that was not ended.
+    processes = num_processes(len(stages))
     outcomes = (
         (run_stage(config, partial(on_step, index)) for index, config in enumerate(runs))
         if processes == 1
-        else run_side_by_side(runs, processes, rasterizer, on_step)
+        else run_side_by_side(runs, processes, rasterizer, on_step, companions or Companions())
     )
     for name, outcome in zip(missing, outcomes, strict=True):
         for note in outcome["notes"]:
