@@ -23,7 +23,7 @@ import tyro
 from sampling_profiler import SamplingProfiler
 
 from splatart_ns.plugin.companion import Companions
-from splatart_ns.plugin.imports import import_less
+from splatart_ns.plugin.imports import few_imports
 
 
 @dataclasses.dataclass
@@ -57,8 +57,8 @@ def main(options: Options) -> None:
     profiler = SamplingProfiler()
     with profiler if options.profile else contextlib.nullcontext(), Companions() as companions:
         companions.start_early()  # and what follows as `splatart fit` does it
-        import_less()
-        from splatart_ns.plugin import fit as fitting
+        with few_imports():
+            from splatart_ns.plugin import fit as fitting
 
         apply(options.set, options.quality, fitting)
         imported = time.perf_counter()

@@ -66,9 +66,6 @@ class Fitting:
         return [check, *semantic, pose, joint, *exports, summary]
 
     def run(self, stage: str, work: Work) -> tuple[dict[str, Any], Sequence[str]]:
-        from splatart_ns.plugin.imports import import_less
-
-        import_less()
         import torch
 
         from splatart_ns.rasterize.rasterization import set_backend
@@ -92,7 +89,10 @@ class Fitting:
         }
 
     def _settings(self, work: Work) -> Settings:
-        from splatart_ns.plugin.fit import Settings
+        from splatart_ns.plugin.imports import few_imports
+
+        with few_imports():
+            from splatart_ns.plugin.fit import Settings
 
         given = work.entry.settings
         return Settings(given["quality"], given["root"], given["seed"], self.rasterizer, list(given["joints"]))

@@ -39,14 +39,14 @@ class Fit:
 
     def run(self) -> None:
         from splatart_ns.plugin.companion import Companions
-        from splatart_ns.plugin.imports import import_less
+        from splatart_ns.plugin.imports import few_imports
 
         with Companions() as companions:
             if not (self.output_dir / "report.json").exists():  # else the states may be there already
                 companions.start_early()
-            import_less()
-            choose_rasterizer(self.rasterizer)
-            from splatart_ns.plugin.fit import fit
+            with few_imports():
+                from splatart_ns.plugin.fit import fit
 
+            choose_rasterizer(self.rasterizer)
             how = (self.quality, self.root, self.seed, self.rasterizer, self.joint, self.worlds, self.refine_cameras)
             CONSOLE.print(f"Bundle: {fit(self.capture, self.output_dir, *how, companions)}")

@@ -21,7 +21,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from splatart_ns.errors import InputError
 from splatart_ns.machine import num_cores, num_gpus
-from splatart_ns.plugin.imports import import_less
+from splatart_ns.plugin.imports import few_imports
 
 # Imported by the process that trains: who starts it need not wait for them.
 if TYPE_CHECKING:
@@ -109,13 +109,13 @@ class Companions:
 
 def _serve(source: BinaryIO, tell: Callable[[str, Any], None]) -> None:
     """The process: train what `Companion.train` sends, until the other end closes the pipe or dies."""
-    import_less()
-    import torch
-    from nerfstudio.utils.rich_utils import CONSOLE
+    with few_imports():
+        import torch
+        from nerfstudio.utils.rich_utils import CONSOLE
 
-    from splatart_ns.plugin.semantic import SemanticModel  # noqa: F401  (the stage that has several runs)
-    from splatart_ns.plugin.stage_run import run_stage
-    from splatart_ns.rasterize.rasterization import set_backend
+        from splatart_ns.plugin.semantic import SemanticModel  # noqa: F401  (the stage that has several runs)
+        from splatart_ns.plugin.stage_run import run_stage
+        from splatart_ns.rasterize.rasterization import set_backend
 
     runs: queue.SimpleQueue[tuple[TrainerConfig, Backend, int]] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(source, runs), daemon=True).start()

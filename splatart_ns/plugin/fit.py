@@ -46,15 +46,21 @@ class Effort:
     """Gaussians that each state starts from."""
     steps: int
     """Steps on geometry and colour of each state."""
+    part_steps: int
+    """Steps on the parts of each state, which start from the labels' votes."""
     merge_steps: int
     """Steps on the merged Gaussians of all states."""
+    downscale: int = 1
+    """How many times smaller than they are images are looked at, where `SMALLEST` are left."""
 
 
 EFFORTS: dict[Quality, Effort] = {
-    "draft": Effort(gaussians=4000, steps=400, merge_steps=150),
-    "standard": Effort(gaussians=8000, steps=1000, merge_steps=250),
-    "high": Effort(gaussians=16000, steps=3000, merge_steps=1500),
+    "draft": Effort(gaussians=4000, steps=450, part_steps=30, merge_steps=100, downscale=2),
+    "standard": Effort(gaussians=8000, steps=1000, part_steps=100, merge_steps=250),
+    "high": Effort(gaussians=16000, steps=3000, part_steps=100, merge_steps=1500),
 }
+SMALLEST = 128
+"""Along the shorter side of images that are made smaller."""
 
 
 @dataclass(frozen=True)
@@ -222,8 +228,7 @@ def stage_configs(capture: Capture, bundle: Path, settings: Settings) -> dict[st
 def _semantic_config(capture: Capture, state: int, runs: Path, settings: Settings) -> TrainerConfig:
     config = copy.deepcopy(semantic_method.config)
     effort = EFFORTS[settings.quality]
-    part_steps = config.max_num_iterations - config.pipeline.model.semantic_start
-    config.max_num_iterations = effort.steps + part_steps
+    config.max_num_iterations = effort.steps + effort.part_steps
     config.pipeline.model.semantic_start = effort.steps
     config.pipeline.model.refine_cameras = settings.refine_cameras
     config.pipeline.model.stop_split_at = 7 * effort.steps // 10
@@ -267,9 +272,11 @@ def _placed(
     """With its capture, its run folder, and none of what `ns-train` shows and saves meanwhile."""
     config.data = capture.path.absolute()
     config.pipeline.datamanager.data = config.data
+    config.pipeline.datamanager.camera_res_scale_factor = 1 / _downscale(capture, EFFORTS[settings.quality])
     config.pipeline.datamanager.dataparser.data = config.data
     config.pipeline.datamanager.dataparser.state = state
     config.pipeline.datamanager.dataparser.worlds = settings.worlds
+    config.pipeline.datamanager.dataparser.checked = True
     config.machine.seed = settings.seed
     config.output_dir = runs
     config.experiment_name = experiment
@@ -280,6 +287,13 @@ def _placed(
     config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
     config.steps_per_save = config.max_num_iterations + 1  # at the end only: a stage is repeated as a whole
     return config
+
+
+def _downscale(capture: Capture, effort: Effort) -> int:
+    """How many times smaller than they are the images of all states are looked at."""
+    cameras = [frame.camera for state in capture.states for frame in state.frames]
+    least = min(min(camera.width, camera.height) for camera in cameras)
+    return max(1, min(effort.downscale, least // SMALLEST))
 
 
 def _config_file(config: TrainerConfig) -> Path:

@@ -5,11 +5,11 @@ import sys
 
 SCRIPT = """
 import sys
-from splatart_ns.plugin.imports import import_less
+from splatart_ns.plugin.imports import few_imports
 
-import_less()
-import torch
-import splatart_ns.plugin.fit
+with few_imports():
+    import torch
+    import splatart_ns.plugin.fit
 
 weight = torch.nn.Parameter(torch.ones(3))
 optimizer = torch.optim.Adam([weight])
