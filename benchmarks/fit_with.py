@@ -22,7 +22,8 @@ from unittest import mock
 import tyro
 from sampling_profiler import SamplingProfiler
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as splatart_ns.cli does
+from splatart_ns.plugin.companion import Companions
+from splatart_ns.plugin.imports import few_imports
 
 
 @dataclasses.dataclass
@@ -54,14 +55,15 @@ def main(options: Options) -> None:
     if options.profile:
         os.environ["OMP_NUM_THREADS"] = "1"
     profiler = SamplingProfiler()
-    with profiler if options.profile else contextlib.nullcontext():
-        from splatart_ns.plugin import fit as fitting
+    with profiler if options.profile else contextlib.nullcontext(), Companions() as companions:
+        companions.start_early()  # and what follows as `splatart fit` does it
+        with few_imports():
+            from splatart_ns.plugin import fit as fitting
 
         apply(options.set, options.quality, fitting)
         imported = time.perf_counter()
-        fitting.fit(
-            options.capture, options.output_dir, options.quality, seed=options.seed, rasterizer=options.rasterizer
-        )
+        how = {"seed": options.seed, "rasterizer": options.rasterizer, "companions": companions}
+        fitting.fit(options.capture, options.output_dir, options.quality, **how)
     seconds = {"imports": imported - start, "all": time.perf_counter() - start}
     (options.output_dir / "seconds.json").write_text(json.dumps(seconds))
     if options.profile:

@@ -33,10 +33,11 @@ from splatart_ns.capture.assembly import Assembly, Chain, Face, add_carcass, add
 from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.images import read_labels
+from splatart_ns.capture.light import Light
 from splatart_ns.capture.procedural import synthesize_object
-from splatart_ns.capture.ray_caster import Light
 from splatart_ns.capture.shapes import drum
-from splatart_ns.capture.synthesis import SynthesisOptions, synthesize
+from splatart_ns.capture.synthesis import synthesize
+from splatart_ns.capture.synthesis_options import SynthesisOptions
 from splatart_ns.capture.textures import Colour
 from splatart_ns.evaluation.ground_truth import GroundTruth, TrueJoint, load_ground_truth
 from splatart_ns.evaluation.joints import displacement, joint_errors, rotation_error

@@ -27,8 +27,9 @@ from rich.table import Table
 
 from splatart_ns.capture.capture import Camera
 from splatart_ns.capture.images import write_png
+from splatart_ns.capture.light import Light
 from splatart_ns.capture.procedural import write_object
-from splatart_ns.capture.ray_caster import Light, RayCaster
+from splatart_ns.capture.ray_caster import RayCaster
 from splatart_ns.capture.robot import read_urdf
 from splatart_ns.capture.scene import Scene, camera_poses, ground_truth
 from splatart_ns.capture.surface import Surface, join

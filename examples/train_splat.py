@@ -13,7 +13,7 @@ import torch
 
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.procedural import synthesize_object
-from splatart_ns.capture.synthesis import SynthesisOptions
+from splatart_ns.capture.synthesis_options import SynthesisOptions
 from splatart_ns.capture.view import load_views
 from splatart_ns.rasterize import rasterization
 from splatart_ns.rasterize.ssim import l1_ssim_loss

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from splatart_ns.capture.procedural import synthesize_object
-from splatart_ns.capture.synthesis import SynthesisOptions
+from splatart_ns.capture.synthesis_options import SynthesisOptions
 
 COMMAND = [sys.executable, "-c", "from splatart_ns.cli import main; main()"]
 

@@ -12,7 +12,7 @@ from PIL import Image
 
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.procedural import write_object
-from splatart_ns.capture.synthesis import SynthesisOptions
+from splatart_ns.capture.synthesis_options import SynthesisOptions
 from splatart_ns.rasterize.rasterization import default_backend, set_backend
 
 JOINT = "base_to_lid"

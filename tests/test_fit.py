@@ -5,6 +5,7 @@ import math
 import shutil
 import signal
 import time
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -161,6 +162,25 @@ def test_the_users_word_on_a_joint_holds(fit_copy, hinge_capture, run_main):
     assert finished_stages(fit_copy) == STAGES
     code, _, errors = run_main(*arguments, "--joint", "lid:body")
     assert code == 2 and "body" in errors and "base, lid" in errors
+
+
+@pytest.mark.parametrize(("pixels", "times"), [((256, 300), 2), ((1000, 800), 2), ((255, 300), 1)])
+def test_a_draft_looks_at_smaller_images_where_enough_of_them_is_left(hinge_capture, tmp_path, pixels, times):
+    from splatart_ns.capture.formats import load_capture
+    from splatart_ns.plugin.fit import Settings, stage_configs
+
+    capture = load_capture(hinge_capture)
+    sizes = iter([pixels])
+
+    def resized(frame):
+        width, height = next(sizes, (1000, 1000))
+        return replace(frame, camera=replace(frame.camera, width=width, height=height))
+
+    states = [replace(state, frames=tuple(map(resized, state.frames))) for state in capture.states]
+    capture = replace(capture, states=states)
+    for quality, expected in [("draft", times), ("standard", 1)]:
+        for config in stage_configs(capture, tmp_path, Settings(quality, None, 0)).values():
+            assert config.pipeline.datamanager.camera_res_scale_factor == 1 / expected
 
 
 class TestResuming:

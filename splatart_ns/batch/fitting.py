@@ -89,7 +89,10 @@ class Fitting:
         }
 
     def _settings(self, work: Work) -> Settings:
-        from splatart_ns.plugin.fit import Settings
+        from splatart_ns.plugin.imports import few_imports
+
+        with few_imports():
+            from splatart_ns.plugin.fit import Settings
 
         given = work.entry.settings
         return Settings(given["quality"], given["root"], given["seed"], self.rasterizer, list(given["joints"]))

@@ -11,7 +11,8 @@ from pathlib import Path
 from splatart_ns.capture.articulated_object import ArticulatedObject, Joint, Link
 from splatart_ns.capture.random_objects import MOST_PARTS, random_joint_values, random_object
 from splatart_ns.capture.shapes import blocks, drum, rounded_box
-from splatart_ns.capture.synthesis import SynthesisOptions, synthesize
+from splatart_ns.capture.synthesis import synthesize
+from splatart_ns.capture.synthesis_options import OBJECTS, SynthesisOptions
 from splatart_ns.errors import InputError
 
 _BLUES = ((32, 62, 120), (92, 148, 205), (218, 228, 236), (245, 190, 40))
@@ -116,7 +117,7 @@ def _arm() -> ArticulatedObject:
     )
 
 
-_BUILDERS: dict[str, Callable[[], ArticulatedObject]] = {"hinge": _hinge, "drawer": _drawer, "arm": _arm}
+_BUILDERS: dict[str, Callable[[], ArticulatedObject]] = dict(zip(OBJECTS, (_hinge, _drawer, _arm), strict=True))
 
 _STATES = {
     "hinge": ("lid_joint=0.5", "lid_joint=1.7"),
@@ -124,9 +125,6 @@ _STATES = {
     "arm": ("yaw=-0.4,shoulder=0.1,elbow=1.5", "yaw=0.5,shoulder=0.7,elbow=0.7"),
 }
 """Joint values of the two states that a built-in object is usually shown in."""
-
-OBJECTS = tuple(_BUILDERS)
-"""The names of the built-in objects."""
 
 
 def is_object_name(text: str) -> bool:

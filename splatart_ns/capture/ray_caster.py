@@ -9,20 +9,9 @@ import numpy as np
 
 from splatart_ns.capture.capture import Camera
 from splatart_ns.capture.images import undistorted_points
+from splatart_ns.capture.light import Light
 from splatart_ns.capture.surface import Surface, join
 from splatart_ns.errors import InputError
-
-
-@dataclass(frozen=True)
-class Light:
-    """A sun fixed in the world, and a sky that lights from all around."""
-
-    direction: tuple[float, float, float] = (0.3, -0.5, 0.8)
-    """From the object towards the sun, in the world; z is up."""
-    ambient: float = 0.65
-    """The share of the sky's light, 0 to 1; the rest is the sun's."""
-    shadows: bool = True
-    """Cast hard shadows."""
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -15,47 +13,16 @@ import trimesh
 
 from splatart_ns.capture.capture import Camera
 from splatart_ns.capture.images import write_png
-from splatart_ns.capture.ray_caster import Light, RayCaster
+from splatart_ns.capture.ray_caster import RayCaster
 from splatart_ns.capture.robot import Joint, Robot, read_urdf
 from splatart_ns.capture.scene import Scene, camera_poses, ground_truth
+from splatart_ns.capture.synthesis_options import SynthesisOptions
 from splatart_ns.errors import InputError
 from splatart_ns.files import new_folder
 
 POINTS_PER_PART = 10_000
 _TURN = 1.75
 """Radian: joints that turn further than this are moved within a window of it, so that states have views in common."""
-
-
-@dataclass(frozen=True)
-class SynthesisOptions:
-    """How a capture is rendered."""
-
-    states: int = 2
-    """How many configurations, when no joint values are given."""
-    joint_values: tuple[str, ...] = ()
-    """One "joint=value,joint=value" per state (radian, length); without it, values are drawn within the limits."""
-    freeze: tuple[str, ...] = ()
-    """"joint=value" for joints that are held there in all states; their links become one part."""
-    train_views: int = 40
-    """Training views per state."""
-    test_views: int = 8
-    """Test views per state, and of the novel configuration."""
-    views: Literal["sphere", "hemisphere"] = "sphere"
-    """See the object from everywhere, or from above only."""
-    resolution: int = 256
-    """Pixels along each side of an image."""
-    fov_degrees: float = 35.0
-    """Field of view across an image."""
-    labelled_fraction: float = 1.0
-    """Share of the training views of a state that come with part labels, 0 to 1; test views always do."""
-    samples: int = 2
-    """Rays per pixel along each side, against jagged edges."""
-    light: Light = field(default_factory=Light)
-    """What lights the object."""
-    length_unit: str = "metre"
-    """The URDF's unit of length, as the capture notes it."""
-    seed: int = 0
-    """The same seed writes the same bytes."""
 
 
 def synthesize(urdf: Path, output_dir: Path, options: SynthesisOptions | None = None) -> Path:

@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-import trimesh
 from torch import Tensor
 
 from splatart_ns.capture import images
@@ -122,6 +121,8 @@ def load_points(path: Path, normalization: Normalization, placement: np.ndarray 
     `placement` [4, 4] brings its world to the capture's.
     Raises `InputError` if it cannot be read or is empty.
     """
+    import trimesh  # which takes a while, for what few captures have
+
     try:  # from bytes: a file could name a texture elsewhere
         cloud = trimesh.load(io.BytesIO(images.read_bytes(path)), file_type="ply", process=False)
         xyz = np.asarray(cloud.vertices, dtype=np.float64)

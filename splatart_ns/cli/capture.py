@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from splatart_ns.capture.synthesis import SynthesisOptions
+from splatart_ns.capture.synthesis_options import SynthesisOptions
 from splatart_ns.cli.common import CONSOLE, choose_rasterizer, device
 from splatart_ns.errors import InputError
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from splatart_ns.capture.procedural import OBJECTS
-from splatart_ns.capture.synthesis import SynthesisOptions
+from splatart_ns.capture.synthesis_options import OBJECTS, SynthesisOptions
 from splatart_ns.cli.bundle import Evaluate
 from splatart_ns.cli.common import CONSOLE, Quality
 from splatart_ns.cli.fit import Fit

@@ -38,8 +38,15 @@ class Fit:
     """auto takes gsplat on CUDA, else numba where it is installed, else torch."""
 
     def run(self) -> None:
-        choose_rasterizer(self.rasterizer)
-        from splatart_ns.plugin.fit import fit
+        from splatart_ns.plugin.companion import Companions
+        from splatart_ns.plugin.imports import few_imports
 
-        how = (self.quality, self.root, self.seed, self.rasterizer, self.joint, self.worlds, self.refine_cameras)
-        CONSOLE.print(f"Bundle: {fit(self.capture, self.output_dir, *how)}")
+        with Companions() as companions:
+            if not (self.output_dir / "report.json").exists():  # else the states may be there already
+                companions.start_early()
+            with few_imports():
+                from splatart_ns.plugin.fit import fit
+
+            choose_rasterizer(self.rasterizer)
+            how = (self.quality, self.root, self.seed, self.rasterizer, self.joint, self.worlds, self.refine_cameras)
+            CONSOLE.print(f"Bundle: {fit(self.capture, self.output_dir, *how, companions)}")

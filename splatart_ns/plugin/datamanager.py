@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -21,20 +23,30 @@ class CaptureDataset(InputDataset):
 
     exclude_batch_keys_from_device = [*InputDataset.exclude_batch_keys_from_device, "semantics"]
 
+    @property
+    def downscale(self) -> int:
+        """How many times smaller than the files images are looked at."""
+        return round(1 / self.scale_factor)
+
     def get_view(self, image_idx: int) -> View:
         """One frame's pixels, undistorted."""
         metadata = self._dataparser_outputs.metadata
-        frame = metadata["frames"][image_idx]
-        return load_view(frame, metadata["normalization"], downscale=round(1 / self.scale_factor))
+        return load_view(metadata["frames"][image_idx], metadata["normalization"], self.downscale)
+
+    @cached_property
+    def views(self) -> list[View]:
+        """All frames' pixels, for who needs them again and again."""
+        with ThreadPoolExecutor() as pool:
+            return list(pool.map(self.get_view, range(len(self))))
 
     def get_data(self, image_idx: int, image_type: str = "float32") -> dict[str, Any]:
         """image [H, W, 3 or 4] (the silhouette as alpha, where there is one), semantics [H, W, 1], mask [H, W, 1]."""
-        view = self.get_view(image_idx)
+        view = self.views[image_idx] if "views" in self.__dict__ else self.get_view(image_idx)
         image = view.rgb if view.alpha is None else torch.cat([view.rgb, view.alpha[..., None]], dim=-1)
         labels = torch.full(view.rgb.shape[:2], UNLABELLED, dtype=torch.uint8) if view.labels is None else view.labels
         data = {
             "image_idx": image_idx,
-            "image": image if image_type == "uint8" else image.float() / 255,
+            "image": image.clone() if image_type == "uint8" else image.float() / 255,
             "semantics": labels[..., None].long(),
         }
         if view.mask is not None:
@@ -78,7 +90,7 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         points = None
         if state.points is not None:
             points = SeedPoints(*load_points(state.points, self.capture.normalization, state.placement))
-        views = [self.train_dataset.get_view(i) for i in range(len(self.train_dataset))]
+        views = self.train_dataset.views
         if any(view.alpha is None for view in views):
             outlined = [v for view in views if (v := with_silhouette(view)) is not None]
             around = surrounding_points(views, count, generator) if points is None else points.drawn(count, generator)

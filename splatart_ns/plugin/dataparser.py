@@ -6,12 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+import tyro
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
 from splatart_ns.capture.capture import Capture, Worlds
 from splatart_ns.capture.check import require_valid
+from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.images import undistorted_camera
 from splatart_ns.capture.worlds import focus_on_focus
 from splatart_ns.errors import InputError
@@ -26,6 +28,8 @@ class SplatartDataParserConfig(DataParserConfig):
     """Which state of the object, counted from 0 in the order of the state folders."""
     worlds: Worlds | None = None
     """How the states' worlds differ; what the capture says when not given, and else shared."""
+    checked: tyro.conf.Suppress[bool] = False
+    """Whether the capture was checked before, as `splatart fit` does for all its runs."""
 
 
 @dataclass
@@ -40,13 +44,13 @@ class SplatartDataParser(DataParser):
 
     @property
     def capture(self) -> Capture:
-        """The whole capture, states of separate worlds side by side; checked when it is first read.
+        """The whole capture, states of separate worlds side by side; checked when it is first read, if never before.
 
         Raises:
             InputError: for a capture that cannot be used, or a state that it does not have.
         """
         if self._capture is None:
-            capture = require_valid(self.config.data)
+            capture = (load_capture if self.config.checked else require_valid)(self.config.data)
             if not 0 <= self.config.state < len(capture.states):
                 raise InputError(
                     f"{self.config.data} has no state {self.config.state}; "

@@ -29,8 +29,9 @@ from splatart_ns.files import write_json
 from splatart_ns.method_configs.joint import method as joint_method
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.method_configs.semantic import method as semantic_method
+from splatart_ns.plugin.companion import Companions, Outcome
 from splatart_ns.plugin.semantic import RefineCameras
-from splatart_ns.plugin.stage_run import Outcome, num_processes, run_side_by_side, run_stage
+from splatart_ns.plugin.stage_run import num_processes, run_side_by_side, run_stage
 from splatart_ns.rasterize.rasterization import Backend, default_backend, set_backend
 from splatart_ns.stages.joint_constraint import parse_constraints
 
@@ -45,15 +46,21 @@ class Effort:
     """Gaussians that each state starts from."""
     steps: int
     """Steps on geometry and colour of each state."""
+    part_steps: int
+    """Steps on the parts of each state, which start from the labels' votes."""
     merge_steps: int
     """Steps on the merged Gaussians of all states."""
+    downscale: int = 1
+    """How many times smaller than they are images are looked at, where `SMALLEST` are left."""
 
 
 EFFORTS: dict[Quality, Effort] = {
-    "draft": Effort(gaussians=4000, steps=400, merge_steps=150),
-    "standard": Effort(gaussians=8000, steps=1000, merge_steps=250),
-    "high": Effort(gaussians=16000, steps=3000, merge_steps=1500),
+    "draft": Effort(gaussians=4000, steps=450, part_steps=30, merge_steps=100, downscale=2),
+    "standard": Effort(gaussians=8000, steps=1000, part_steps=100, merge_steps=250),
+    "high": Effort(gaussians=16000, steps=3000, part_steps=100, merge_steps=1500),
 }
+SMALLEST = 128
+"""Along the shorter side of images that are made smaller."""
 
 
 @dataclass(frozen=True)
@@ -160,8 +167,11 @@ def fit(
     joints: tuple[str, ...] = (),
     worlds: Worlds | None = None,
     refine_cameras: RefineCameras = "auto",
+    companions: Companions | None = None,
 ) -> Path:
     """Run what is missing of all stages and leave the bundle in `output_dir`.
+
+    `companions` may have been started before this module was imported, which takes them as long as this process.
 
     Raises:
         InputError: for a capture, a root, a joint, a folder or a rasterizer that cannot be used.
@@ -182,7 +192,7 @@ def fit(
     configs = stage_configs(capture, output_dir, settings)
     pose, joint = (configs.pop(name) for name in ("pose", "joint"))
     with _progress() as progress:
-        _train(configs, rasterizer, report, progress)
+        _train(configs, rasterizer, report, progress, companions or Companions())
         _train({"pose": pose}, rasterizer, report, progress)
         _train({"joint": joint}, rasterizer, report, progress, whole=_is_whole(output_dir))
     return output_dir
@@ -218,8 +228,7 @@ def stage_configs(capture: Capture, bundle: Path, settings: Settings) -> dict[st
 def _semantic_config(capture: Capture, state: int, runs: Path, settings: Settings) -> TrainerConfig:
     config = copy.deepcopy(semantic_method.config)
     effort = EFFORTS[settings.quality]
-    part_steps = config.max_num_iterations - config.pipeline.model.semantic_start
-    config.max_num_iterations = effort.steps + part_steps
+    config.max_num_iterations = effort.steps + effort.part_steps
     config.pipeline.model.semantic_start = effort.steps
     config.pipeline.model.refine_cameras = settings.refine_cameras
     config.pipeline.model.stop_split_at = 7 * effort.steps // 10
@@ -263,9 +272,11 @@ def _placed(
     """With its capture, its run folder, and none of what `ns-train` shows and saves meanwhile."""
     config.data = capture.path.absolute()
     config.pipeline.datamanager.data = config.data
+    config.pipeline.datamanager.camera_res_scale_factor = 1 / _downscale(capture, EFFORTS[settings.quality])
     config.pipeline.datamanager.dataparser.data = config.data
     config.pipeline.datamanager.dataparser.state = state
     config.pipeline.datamanager.dataparser.worlds = settings.worlds
+    config.pipeline.datamanager.dataparser.checked = True
     config.machine.seed = settings.seed
     config.output_dir = runs
     config.experiment_name = experiment
@@ -276,6 +287,13 @@ def _placed(
     config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
     config.steps_per_save = config.max_num_iterations + 1  # at the end only: a stage is repeated as a whole
     return config
+
+
+def _downscale(capture: Capture, effort: Effort) -> int:
+    """How many times smaller than they are the images of all states are looked at."""
+    cameras = [frame.camera for state in capture.states for frame in state.frames]
+    least = min(min(camera.width, camera.height) for camera in cameras)
+    return max(1, min(effort.downscale, least // SMALLEST))
 
 
 def _config_file(config: TrainerConfig) -> Path:
@@ -291,7 +309,12 @@ def _is_whole(bundle: Path) -> bool:
 
 
 def _train(
-    stages: dict[str, TrainerConfig], rasterizer: Backend, report: Report, progress: Progress, whole: bool = True
+    stages: dict[str, TrainerConfig],
+    rasterizer: Backend,
+    report: Report,
+    progress: Progress,
+    companions: Companions | None = None,
+    whole: bool = True,
 ) -> None:
     """Train stages that do not need each other, but those that are done and whose results are `whole`."""
     missing: dict[str, TrainerConfig] = {}
@@ -310,13 +333,12 @@ def _train(
         progress.update(tasks[index], completed=steps)
 
     runs = list(missing.values())
-    processes = num_processes(
-        len(stages)
-    )  # of all stages: a fit that goes on has the results of one that was not ended
+    # Of all stages: a fit that goes on has the results of one that was not ended.
+    processes = num_processes(len(stages))
     outcomes = (
         (run_stage(config, partial(on_step, index)) for index, config in enumerate(runs))
         if processes == 1
-        else run_side_by_side(runs, processes, rasterizer, on_step)
+        else run_side_by_side(runs, processes, rasterizer, on_step, companions or Companions())
     )
     for name, outcome in zip(missing, outcomes, strict=True):
         for note in outcome["notes"]:

@@ -136,7 +136,8 @@ class PosePipeline(VanillaPipeline):
             return
         capture = self.datamanager.capture
         runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
-        states = [read_state(capture, s, run, self.model.num_parts, device) for s, run in enumerate(runs)]
+        what = (self.model.num_parts, device, self.datamanager.train_dataset.downscale)
+        states = [read_state(capture, s, run, *what) for s, run in enumerate(runs)]
         self.views = [state.views for state in states]
         self._cameras_refined = any(state.cameras_refined for state in states)
         splats = [state.splat.select(state.splat.part_ids > 0) for state in states]

@@ -213,7 +213,7 @@ class SemanticPipeline(VanillaPipeline):
         dataset = self.datamanager.train_dataset
         self._labelled = {i for i, frame in enumerate(dataset.metadata["frames"]) if frame.labels is not None}
         if self.datamanager.test_mode == "val":
-            self._views = [dataset.get_view(i) for i in range(len(dataset))]
+            self._views = list(dataset.views)
             self._given = torch.stack([view.viewmat for view in self._views]).double()
             self.model.viewmats = self._given.to(self.device)
 

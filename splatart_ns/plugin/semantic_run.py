@@ -28,8 +28,10 @@ class LabelledState:
     cameras_refined: bool
 
 
-def read_state(capture: Capture, state: int, run: Path, num_parts: int, device: str) -> LabelledState:
-    """What a run, given by its config.yml, made of a state.
+def read_state(
+    capture: Capture, state: int, run: Path, num_parts: int, device: str, downscale: int = 1
+) -> LabelledState:
+    """What a run, given by its config.yml, made of a state; views are `downscale` times smaller than the images.
 
     Raises:
         InputError: the run is not of this capture, or learned no parts.
@@ -43,7 +45,7 @@ def read_state(capture: Capture, state: int, run: Path, num_parts: int, device: 
         )
     if not bool((splat.part_ids > 0).any()):
         raise InputError(f"{run} learned no parts; train splatart-semantic longer, with labelled frames.")
-    views = [view.to(device) for view in learned_views(capture, state, checkpoint)]
+    views = [view.to(device) for view in learned_views(capture, state, checkpoint, downscale)]
     views = [with_silhouette(view) or rendered_silhouette(view, splat) for view in views]
     return LabelledState(splat, views, bool(checkpoint["_model.cameras_refined"]))
 
@@ -66,10 +68,10 @@ def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
     return tuple(found[s] for s in range(num_states))
 
 
-def learned_views(capture: Capture, state: int, checkpoint: dict[str, Tensor]) -> list[View]:
+def learned_views(capture: Capture, state: int, checkpoint: dict[str, Tensor], downscale: int = 1) -> list[View]:
     """The training views of a state as its splatart-semantic run saw them in the end: with the cameras that it refined,
     at one exposure, and without the labels that it did not trust."""
-    views = load_views(capture, state, "train")
+    views = load_views(capture, state, "train", downscale)
     learned = [checkpoint.get(f"_model.{name}", ()) for name in ("viewmats", "gains", "trusted")]
     if any(len(values) != len(views) for values in learned):
         raise InputError(

@@ -1,37 +1,25 @@
-"""A stage's run of nerfstudio's trainer: in this process, or several side by side in processes of their own."""
+"""A stage's run of nerfstudio's trainer: in this process, or several side by side."""
 
 from __future__ import annotations
 
-import io
-import json
-import os
-import pickle
 import resource
-import subprocess
 import sys
-import tempfile
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import contextmanager, suppress
+from functools import partial
 from queue import SimpleQueue
-from typing import Any, BinaryIO
-
-# Of both ends of `run_side_by_side`; it is read when torch is imported. See splatart_ns/cli.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.utils.rich_utils import CONSOLE
 
-from splatart_ns.errors import InputError
 from splatart_ns.machine import num_cores
+from splatart_ns.plugin.companion import Companion, Companions, Outcome
 from splatart_ns.plugin.compat import seed_everything, stop_event_writers
-from splatart_ns.rasterize.rasterization import Backend, set_backend
-
-Outcome = dict[str, Any]
-"""What a run took: seconds, iterations, gaussians, peak_memory_mb; its notes for the user; and what else it found."""
+from splatart_ns.rasterize.rasterization import Backend
 
 
 def run_stage(config: TrainerConfig, on_step: Callable[[int], None]) -> Outcome:
@@ -62,101 +50,75 @@ def num_processes(runs: int) -> int:
 
 
 def run_side_by_side(
-    configs: Sequence[TrainerConfig], processes: int, backend: Backend, on_step: Callable[[int, int], None]
+    configs: Sequence[TrainerConfig],
+    processes: int,
+    backend: Backend,
+    on_step: Callable[[int, int], None],
+    companions: Companions,
 ) -> Iterator[Outcome]:
     """Train stages that do not need each other; yields their outcomes in order, each when it and all before it ended.
 
     Args:
         configs: One per run.
-        processes: How many at a time, see `num_processes`; they share the cores evenly.
-        backend: The rasterizer.
-        on_step: Gets the run's number and its finished steps.
+        processes: How many at a time, this one among them, see `num_processes`; they share the cores evenly.
+        backend: The rasterizer, which this process has chosen.
+        on_step: Gets the run's number and its finished steps, on several threads.
+        companions: The other processes; they have ended afterwards.
 
     Raises:
         InputError: raised by a run.
-        RuntimeError: a run ended otherwise; its last words are in the message.
+        RuntimeError: a run in another process ended otherwise; its last words are in the message.
     """
+    waiting = deque(range(len(configs)))
+    ended: SimpleQueue[tuple[int, Outcome | Exception]] = SimpleQueue()
+    failed: list[Exception] = []
     threads = max(1, num_cores() // processes)
-    events: SimpleQueue[tuple[int, str, Any]] = SimpleQueue()
-    waiting, outcomes, following = list(range(len(configs))), {}, 0
-    with ExitStack() as running:
-        for _ in range(min(processes, len(configs))):
-            _start(waiting.pop(0), configs, backend, threads, events, running)
-        while following < len(configs):
-            index, kind, value = events.get()
-            if kind == "step":
-                on_step(index, value)
-            elif kind == "input error":
-                raise InputError(value)
-            elif kind == "end":
-                value.seek(0)
-                words = value.read().decode(errors="replace")[-2000:]
-                raise RuntimeError(f"{configs[index].get_base_dir()} ended without a result: {words}")
-            else:
-                outcomes[index] = value
-                if waiting:
-                    _start(waiting.pop(0), configs, backend, threads, events, running)
-            while following in outcomes:
-                yield outcomes.pop(following)
-                following += 1
 
+    def take() -> int | None:
+        with suppress(IndexError):
+            return waiting.popleft()
 
-def _start(
-    index: int,
-    configs: Sequence[TrainerConfig],
-    backend: Backend,
-    threads: int,
-    events: SimpleQueue[tuple[int, str, Any]],
-    running: ExitStack,
-) -> None:
-    """Start a run in a process of its own, and a thread that hands on what it tells."""
-    words = running.enter_context(tempfile.TemporaryFile())
-    process = subprocess.Popen(
-        [sys.executable, "-m", __name__],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=words,
-        env=os.environ | {"OMP_NUM_THREADS": str(threads)},
-        start_new_session=True,  # Ctrl-C is for this process, which ends the others
-    )
-    running.callback(_end, process)
-    pickle.dump((configs[index], backend), process.stdin)
-    process.stdin.flush()  # and stays open: its end tells the process that this one has died
-
-    def listen() -> None:
-        for line in process.stdout:
-            event = json.loads(line)
-            events.put((index, event["kind"], event["value"]))
-            if event["kind"] == "outcome":
+    def train_beside(companion: Companion) -> None:
+        while (index := take()) is not None:
+            try:
+                ended.put((index, companion.train(configs[index], backend, threads, partial(on_step, index))))
+            except Exception as error:
+                failed.append(error)
+                ended.put((index, error))
                 return
-        events.put((index, "end", words))
 
-    threading.Thread(target=listen, daemon=True).start()
+    def on_own_step(index: int, steps: int) -> None:
+        if failed:
+            raise failed[0]
+        on_step(index, steps)
+
+    with companions, _torch_threads(threads):
+        for companion in companions.first(min(processes, len(configs)) - 1):
+            threading.Thread(target=train_beside, args=(companion,), daemon=True).start()
+        outcomes: dict[int, Outcome] = {}
+        following = 0
+        while following < len(configs):
+            if (index := take()) is not None:
+                ended.put((index, run_stage(configs[index], partial(on_own_step, index))))
+            while following < len(configs) and (index is None or not ended.empty()):
+                number, outcome = ended.get()
+                if isinstance(outcome, Exception):
+                    raise outcome
+                outcomes[number] = outcome
+                while following in outcomes:
+                    yield outcomes.pop(following)
+                    following += 1
 
 
-def _end(process: subprocess.Popen) -> None:
-    process.kill()  # whatever it still does: its files are whole, or its run is repeated
-    process.wait()
-
-
-def _serve(source: BinaryIO, tell: Callable[[str, Any], None]) -> None:
-    """The process of one run: reads (config, backend) that `_start` pickled, trains and tells."""
-    config, backend = pickle.load(source)
-    threading.Thread(target=lambda: (source.read(), os._exit(1)), daemon=True).start()
-    CONSOLE.quiet = True
-    set_backend(backend)
-    told = 0.0
-
-    def on_step(steps: int) -> None:
-        nonlocal told
-        if time.monotonic() - told > 0.2 or steps == config.max_num_iterations:
-            told = time.monotonic()
-            tell("step", steps)
-
+@contextmanager
+def _torch_threads(count: int) -> Iterator[None]:
+    """So many threads of torch, and of the rasterizer."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
     try:
-        tell("outcome", run_stage(config, on_step))
-    except InputError as error:
-        tell("input error", str(error))
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _peak_memory_mb() -> int:
@@ -165,13 +127,3 @@ def _peak_memory_mb() -> int:
         return torch.cuda.max_memory_allocated() // 2**20
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak // (2**20 if sys.platform == "darwin" else 2**10)
-
-
-if __name__ == "__main__":
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what libraries print is no answer
-
-    def tell(kind: str, value: Any) -> None:
-        print(json.dumps({"kind": kind, "value": value}), file=answers, flush=True)
-
-    _serve(io.BufferedReader(sys.stdin.buffer.raw), tell)

@@ -3,10 +3,10 @@ import json
 import numpy as np
 import pytest
 
-from splatart_ns.capture.procedural import OBJECTS, synthesize_object, write_object
+from splatart_ns.capture.procedural import synthesize_object, write_object
 from splatart_ns.capture.robot import read_urdf
 from splatart_ns.capture.shapes import blocks, drum, rounded_box
-from splatart_ns.capture.synthesis import SynthesisOptions
+from splatart_ns.capture.synthesis_options import OBJECTS, SynthesisOptions
 from splatart_ns.errors import InputError
 
 SOLIDS = {

@@ -12,7 +12,7 @@ from splatart_ns.capture.procedural import is_object_name, synthesize_object, wr
 from splatart_ns.capture.random_objects import MOST_PARTS, random_joint_values, random_object
 from splatart_ns.capture.robot import read_urdf
 from splatart_ns.capture.shapes import drum, rounded_box
-from splatart_ns.capture.synthesis import SynthesisOptions
+from splatart_ns.capture.synthesis_options import SynthesisOptions
 from splatart_ns.errors import InputError
 
 SEEDS = range(30)

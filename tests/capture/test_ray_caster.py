@@ -6,7 +6,8 @@ import pytest
 import trimesh
 
 from splatart_ns.capture.capture import Camera
-from splatart_ns.capture.ray_caster import Light, RayCaster
+from splatart_ns.capture.light import Light
+from splatart_ns.capture.ray_caster import RayCaster
 from splatart_ns.capture.surface import Surface, join, merge_coincident
 
 CAMERA = Camera(100.0, 100.0, 32.0, 32.0, 64, 64)

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.scene import camera_poses
-from splatart_ns.capture.synthesis import SynthesisOptions, synthesize
+from splatart_ns.capture.synthesis import synthesize
+from splatart_ns.capture.synthesis_options import SynthesisOptions
 from splatart_ns.errors import InputError
 
 URDF = """<robot name="toy">

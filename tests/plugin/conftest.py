@@ -13,7 +13,7 @@ import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
 from splatart_ns.capture.procedural import synthesize_object
-from splatart_ns.capture.synthesis import SynthesisOptions
+from splatart_ns.capture.synthesis_options import SynthesisOptions
 from splatart_ns.method_configs.semantic import method as semantic_method
 
 

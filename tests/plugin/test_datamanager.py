@@ -56,6 +56,14 @@ def test_one_labelled_opaque_image_says_where_the_object_may_be(opaque_capture_d
     assert len(manager.train_dataparser_outputs.metadata["points3D_xyz"]) >= 200
 
 
+@pytest.mark.parametrize("image_type", ["float32", "uint8"])
+def test_images_that_are_changed_are_not_those_of_the_views(opaque_capture_dir: Path, image_type: str) -> None:
+    dataset = manage(opaque_capture_dir).train_dataset
+    before = dataset.views[0].rgb.clone()
+    dataset.get_data(0, image_type)["image"].zero_()
+    assert torch.equal(dataset.views[0].rgb, before)
+
+
 def test_seed_points_lie_inside_every_silhouette(capture_dir: Path) -> None:
     manager = manage(capture_dir, seed_gaussians=200)
     xyz = manager.train_dataparser_outputs.metadata["points3D_xyz"]

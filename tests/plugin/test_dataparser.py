@@ -1,3 +1,4 @@
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,16 @@ def test_a_split_of_a_state_has_its_frames(capture_dir: Path) -> None:
             outputs = parse(capture_dir, state, split)
             assert outputs.image_filenames == [f.image for f in capture.states[state].split(split)]
             assert len(outputs.cameras) == len(outputs.image_filenames) > 0
+
+
+def test_a_capture_that_was_checked_is_not_checked_again(capture_dir: Path, tmp_path: Path) -> None:
+    capture = shutil.copytree(capture_dir, tmp_path / "capture")
+    broken = parse(capture).image_filenames[0]
+    broken.write_bytes(broken.read_bytes()[:100])
+    with pytest.raises(InputError, match=broken.name):
+        parse(capture)
+    config = SplatartDataParserConfig(data=capture, checked=True)
+    assert broken in config.setup().get_dataparser_outputs("train").image_filenames
 
 
 def test_states_share_one_normalised_world(capture_dir: Path) -> None:

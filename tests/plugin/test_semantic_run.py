@@ -26,5 +26,7 @@ def test_views_are_seen_as_stage_1_left_them(capture_dir):
     seen = learned_views(capture, 0, checkpoint)
     assert [view.labels is not None for view in seen] == trusted.tolist()
     assert torch.equal(torch.stack([view.viewmat for view in seen]), moved.float())
+    small = learned_views(capture, 0, checkpoint, downscale=2)
+    assert [(view.width, *view.rgb.shape[:2]) for view in small] == [(32, 32, 32)] * len(views)
     with pytest.raises(InputError, match="train it again"):
         learned_views(capture, 0, {"_model.viewmats": moved, "_model.gains": checkpoint["_model.gains"]})

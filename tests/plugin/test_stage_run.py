@@ -13,6 +13,7 @@ from rich.progress import Progress
 
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.errors import InputError
+from splatart_ns.plugin.companion import Companions
 from splatart_ns.plugin.fit import Report, Settings, _semantic_config, _train
 from splatart_ns.plugin.stage_run import num_processes, run_side_by_side
 
@@ -30,7 +31,7 @@ def configs(hinge_capture, tmp_path):
 
 def test_outcomes_come_in_order_and_every_run_is_saved(configs):
     steps = {0: [], 1: []}
-    outcomes = list(run_side_by_side(configs, 2, "auto", lambda index, done: steps[index].append(done)))
+    outcomes = list(run_side_by_side(configs, 2, "auto", lambda index, done: steps[index].append(done), Companions()))
     assert [outcome["iterations"] for outcome in outcomes] == [4, 4]
     assert all(outcome["gaussians"] > 0 and outcome["seconds"] > 0 for outcome in outcomes)
     assert all(done == sorted(done) and done[-1] == 4 for done in steps.values())
@@ -56,36 +57,52 @@ def test_one_process_after_the_other_leaves_the_same(configs, tmp_path):
     def saved():
         return [next(c.get_base_dir().glob("nerfstudio_models/step-*.ckpt")).read_bytes() for c in configs]
 
-    list(run_side_by_side(configs, 2, "auto", lambda *_: None))
+    list(run_side_by_side(configs, 2, "auto", lambda *_: None, Companions()))
     beside = saved()
     shutil.rmtree(tmp_path / "runs")
-    list(run_side_by_side(configs[:1], 2, "auto", lambda *_: None))
-    list(run_side_by_side(configs[1:], 2, "auto", lambda *_: None))
+    list(run_side_by_side(configs[:1], 2, "auto", lambda *_: None, Companions()))
+    list(run_side_by_side(configs[1:], 2, "auto", lambda *_: None, Companions()))
     assert saved() == beside
+
+
+def test_a_process_trains_one_run_after_the_other(configs):
+    with Companions() as companions:
+        (companion,) = companions.first(1)
+        outcomes = [companion.train(config, "auto", 1, lambda steps: None) for config in configs]
+        assert companions.first(1) == [companion]
+    assert [outcome["iterations"] for outcome in outcomes] == [4, 4]
+    assert companion._process.returncode is not None
 
 
 def test_a_users_mistake_in_a_run_is_told_as_one(configs, tmp_path):
     (tmp_path / "capture/state_01/transforms.json").unlink()
     with pytest.raises(InputError):
-        list(run_side_by_side(configs, 2, "auto", lambda *_: None))
+        list(run_side_by_side(configs, 2, "auto", lambda *_: None, Companions()))
 
 
 def test_a_run_that_breaks_shows_its_last_words(configs):
     configs[1].pipeline.datamanager.seed = "no number"
-    with pytest.raises(RuntimeError, match="Traceback"):
-        list(run_side_by_side(configs, 2, "auto", lambda *_: None))
+    with Companions() as companions, pytest.raises(RuntimeError, match="Traceback"):
+        companions.first(1)[0].train(configs[1], "auto", 1, lambda steps: None)
+
+
+def test_a_run_that_breaks_ends_the_others(configs):
+    configs[0].max_num_iterations = configs[1].max_num_iterations = 10**6
+    configs[1].pipeline.datamanager.seed = "no number"
+    with pytest.raises((RuntimeError, TypeError)):  # of another process, or of this one
+        list(run_side_by_side(configs, 2, "auto", lambda *_: None, Companions()))
 
 
 def test_a_run_ends_with_the_process_that_started_it(configs):
     configs[0].max_num_iterations = 10**6
     process = subprocess.Popen(
-        [sys.executable, "-m", "splatart_ns.plugin.stage_run"],
+        [sys.executable, "-m", "splatart_ns.plugin.companion"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
     )
     try:
-        pickle.dump((configs[0], "auto"), process.stdin)
+        pickle.dump((configs[0], "auto", 1), process.stdin)
         process.stdin.flush()
         assert json.loads(process.stdout.readline())["kind"] == "step"
         process.stdin.close()  # as when the other end dies
