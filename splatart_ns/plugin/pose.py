@@ -30,7 +30,7 @@ from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_exte
 from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import initial_motion
 from splatart_ns.stages.unseen import may_have_turned
-from splatart_ns.stages.visibility import visibility
+from splatart_ns.stages.visibility import HIDDEN, clearest, visibility
 from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_views, world_record, world_sentence
 
 
@@ -141,6 +141,8 @@ class PosePipeline(VanillaPipeline):
         self.views = [state.views for state in states]
         self._cameras_refined = any(state.cameras_refined for state in states)
         splats = [state.splat.select(state.splat.part_ids > 0) for state in states]
+        # What lies behind the front of a shut drawer comes to light when the drawer moves, and is nothing but haze.
+        splats = [s.select(clearest(s, v) >= HIDDEN) for s, v in zip(splats, self.views, strict=True)]
         self.model.worlds = torch.from_numpy(np.stack([state.placement for state in capture.states])).to(device)
         if capture.worlds != "shared":
             self._bring_together(splats, capture)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from splatart_ns.capture.view import View
@@ -30,6 +32,10 @@ FINE_PIXELS = 10000
 """Refining needs as many; coarse images would bias it."""
 SIMILAR = 2.5
 """Candidates that cost more than this many times the best are dropped before refining."""
+OTHERWISE = math.radians(60)
+"""A motion that turns a part by so much more or less than another, or about another axis, is quite another one."""
+OTHERS = 2
+"""So many of these are kept beside the best."""
 SUSPECT = 4.0
 """A motion that fits this many times worse than each state's own Gaussians is searched for once more, more widely.
 Right ones measured 1.0 to 2.5, but for parts of which one state hides most."""
@@ -37,6 +43,11 @@ SEARCH_STEPS = (0.6, 0.3, 0.15, 0.08)
 """Steps of that search: part radii, and radians."""
 SLIDE_TURN = 6.0
 """Degrees by which a slide may seem to turn."""
+PITCHED, UNPITCHED = 0.1, 0.03
+"""A motion that shifts a part by more than the first along its axis, in part radii, is no mere turn; one that shifts it
+by less than the second is."""
+SIMILAR_TURN = 1.5
+"""A mere turn is preferred to a motion that is none where it costs less than this many times as much."""
 STILL_RATIO = 1.2
 """A part whose images fit no motion worse than this many times the best motion did not move."""
 
@@ -105,6 +116,7 @@ def initial_motion(
     cost = appearance_cost(fine, torch.stack([e.T for e in ends]))
     T = torch.stack([e.T for e in ends]).cpu().numpy()
     order = prefer_slide(T, cost, distinct(T, cost, source.centroid, source.radius))
+    order = prefer_turn(T, cost, order, source.radius)
     best = ends[order[0]]
     identity_ratio = identity_cost / max(best.cost, 1e-12)
     still = identity_ratio < STILL_RATIO
@@ -148,6 +160,26 @@ def prefer_slide(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]
     return [slides[0], *(i for i in order if i != slides[0])]
 
 
+def prefer_turn(T: np.ndarray, cost: np.ndarray, order: list[int], radius: float) -> list[int]:
+    """`order` of motions [C, 4, 4] by cost [C], with one first that only turns and fits nearly as well as a best one
+    that also shifts the part along its axis.
+
+    A plain door fits nearly as well upside down, but only the right way round it turns about a hinge. Most parts that
+    turn hang on something that rests; that of others another motion merely turns is a rare accident.
+    """
+
+    def shift(i: int) -> float:
+        turn = Rotation.from_matrix(T[i, :3, :3]).as_rotvec()
+        angle = float(np.linalg.norm(turn))
+        return np.inf if np.degrees(angle) < SLIDE_TURN else abs(float(turn @ T[i, :3, 3])) / angle / radius
+
+    best = order[0]
+    if not PITCHED < shift(best) < np.inf:
+        return order
+    turns = [i for i in order if shift(i) < UNPITCHED and cost[i] < SIMILAR_TURN * cost[best]]
+    return [*turns[:1], *(i for i in order if i not in turns[:1])]
+
+
 def appearance_cost(pair: PartPair, T: Tensor) -> np.ndarray:
     """Of motions T [C, 4, 4]: the mean cost with the colours as they are lit, and with their hues alone [C]."""
     return (0.5 * (pair.cost(T) + without_shading(pair).cost(T))).cpu().numpy()
@@ -156,8 +188,14 @@ def appearance_cost(pair: PartPair, T: Tensor) -> np.ndarray:
 def choose(pair: PartPair, candidates: Tensor, similar: float, keep: int = 3) -> Tensor:
     """The distinct motions [K, 4, 4] among `candidates` [C, 4, 4] that render best, best first.
 
-    At most `keep`, and none that costs more than `similar` times the best.
+    At most `keep`, and a few that turn the part quite otherwise: those may be one motion found several times. None
+    costs more than `similar` times the best.
     """
     cost = appearance_cost(pair, candidates)
     order = distinct(candidates.cpu().numpy(), cost, pair.centroid.cpu().numpy(), pair.radius)
-    return candidates[[i for i in order[:keep] if cost[i] <= similar * cost[order[0]]]]
+    R = Rotation.from_matrix(candidates[:, :3, :3].cpu().numpy())
+    chosen = order[:keep]
+    for i in order[keep:]:
+        if len(chosen) < keep + OTHERS and (R[chosen] * R[i].inv()).magnitude().min() > OTHERWISE:
+            chosen.append(i)
+    return candidates[[i for i in chosen if cost[i] <= similar * cost[order[0]]]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -16,23 +17,46 @@ MAX_VIEWS = 40
 """More views than this add nothing to the answer."""
 
 
+HIDDEN = 0.03
+"""A Gaussian of which the `clearest` view shows less lies behind others, and no image says what is there."""
+
+
 def visibility(splat: Splat, views: Sequence[View]) -> Tensor:
     """What each Gaussian contributes to a view [N], in pixels: its blending weights summed over the image.
 
-    The mean over all views. The gradient of a rendering with respect to a feature channel is the sum of blending
-    weights, so one backward pass a view measures all Gaussians.
+    The mean over all views.
+    """
+    views = views[:: -(-len(views) // MAX_VIEWS)]
+    return sum(side_by_side(lambda view: _contribution(splat, view)[0], views)) / len(views)
+
+
+def clearest(splat: Splat, views: Sequence[View]) -> Tensor:
+    """The share of each Gaussian [N] that the view shows which shows it best: 1 if nothing is before it there."""
+    views = views[:: -(-len(views) // MAX_VIEWS)]
+
+    def share(view: View) -> Tensor:
+        contribution, alone = _contribution(splat, view)
+        return torch.where(alone > 0, contribution / alone.clamp_min(1e-6), 0.0)
+
+    return torch.stack(side_by_side(share, views)).amax(0)
+
+
+def _contribution(splat: Splat, view: View) -> tuple[Tensor, Tensor]:
+    """What each Gaussian contributes to a view [N], and what it would if nothing were before it [N], in pixels.
+
+    The gradient of a rendering with respect to a feature channel is the sum of blending weights, so one backward pass
+    measures all Gaussians. Alone, a Gaussian has its opacity times the integral of exp(-x^T C x / 2), 2 pi / sqrt(|C|).
     """
     splat = splat.detach()
     device = splat.means.device
-    views = views[:: -(-len(views) // MAX_VIEWS)]
-
-    def shown_by(view: View) -> Tensor:
-        feature = torch.zeros(len(splat), 1, device=device, requires_grad=True)
-        camera = view.viewmat[None].to(device), view.K[None].to(device)
-        image = render(splat, *camera, view.width, view.height, features=feature, with_depth=False, sh_degree=0)
-        return torch.autograd.grad(image.features.sum(), feature)[0][:, 0]
-
-    return sum(side_by_side(shown_by, views)) / len(views)
+    feature = torch.zeros(len(splat), 1, device=device, requires_grad=True)
+    camera = view.viewmat[None].to(device), view.K[None].to(device)
+    rendering = render(splat, *camera, view.width, view.height, features=feature, with_depth=False, sh_degree=0)
+    contribution = torch.autograd.grad(rendering.features.sum(), feature)[0][:, 0]
+    a, b, c = rendering.info["conics"][0].detach().unbind(-1)
+    drawn = rendering.info["radii"][0].reshape(len(splat), -1).amin(-1) > 0
+    alone = splat.opacities * 2 * math.pi / (a * c - b * b).clamp_min(1e-12).sqrt()
+    return contribution, torch.where(drawn, alone, 0.0)
 
 
 def shown(seen: Tensor, share: float = 0.98) -> Tensor:

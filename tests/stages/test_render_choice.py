@@ -6,7 +6,7 @@ from part_scene import angle_deg, box, motion, photograph, two_states
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.registration import part_points, register
-from splatart_ns.stages.render_choice import choose, initial_motion, prefer_slide
+from splatart_ns.stages.render_choice import choose, initial_motion, prefer_slide, prefer_turn
 from splatart_ns.stages.visibility import visibility
 
 TRUTH = motion((0, 0, 70), (0.3, 0.2, 0.1))
@@ -37,6 +37,32 @@ def test_candidates_much_worse_than_the_best_and_twins_are_dropped(scene):
     twin = TRUTH @ motion((0, 0, 1), (0, 0, 0))
     far = TRUTH @ motion((90, 0, 0), (2, 0, 0))
     assert len(choose(pair, torch.stack([twin, TRUTH, far]), similar=2.5)) == 1
+
+
+def test_a_quite_different_motion_is_kept_beside_many_alike(scene):
+    splats, views, _ = scene
+    pair = part_pair(splats, views, 2, num_views=3, pixels=400)
+    alike = [TRUTH @ motion((0, 0, degrees), (0, 0, 0)) for degrees in (0, 7, -7, 14)]
+    other = TRUTH @ motion((90, 0, 0), (0, 0, 0))
+    kept = choose(pair, torch.stack([*alike, other]), similar=1e9)
+    assert len(kept) == 4 and torch.equal(kept[-1], other)
+
+
+@pytest.mark.parametrize(
+    "turn_cost, rise, first",
+    [(1.2, 0.0, 1), (1.6, 0.0, 0), (1.2, 0.2, 0)],
+    ids=["a door upside down", "one that fits much worse", "neither merely turns"],
+)
+def test_a_mere_turn_is_preferred_to_a_turn_that_fits_hardly_better(turn_cost, rise, first):
+    """A door of a hinge about z; upside down it turns about its normal x, and is shifted along that."""
+    door, upside_down = motion((0, 0, 60), (0.3, 0.2, rise)), motion((180, 0, 0), (0.3, 0.2, 0.0))
+    T = torch.stack([upside_down, door]).numpy()
+    assert prefer_turn(T, np.array([1.0, turn_cost]), [0, 1], radius=0.5)[0] == first
+
+
+def test_a_mere_turn_that_fits_best_stays_first():
+    T = torch.stack([motion((0, 0, 60), (0.3, 0.2, 0.0)), motion((0, 0, 40), (0.1, 0.2, 0.0))]).numpy()
+    assert prefer_turn(T, np.array([1.0, 1.1]), [0, 1], radius=0.5) == [0, 1]
 
 
 def test_the_motion_of_a_part_is_found_from_splats_and_views(scene):
