@@ -8,6 +8,7 @@ comes out of it asks for gradients.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
 from kornia.geometry.liegroup import So3
@@ -77,7 +78,7 @@ def skew(v: Tensor) -> Tensor:
 
 def from_rotation_translation(R: Tensor, t: Tensor) -> Tensor:
     """Rigid motions [..., 4, 4] of rotations [..., 3, 3] and translations [..., 3]; the batches broadcast."""
-    batch = torch.broadcast_shapes(R.shape[:-2], t.shape[:-1])
+    batch = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])  # torch's own loads its compiler, for a second
     top = torch.cat([R.expand(*batch, 3, 3), t.expand(*batch, 3)[..., None]], -1)
     bottom = torch.tensor([0.0, 0.0, 0.0, 1.0]).to(top).expand(*batch, 1, 4)
     return torch.cat([top, bottom], -2)

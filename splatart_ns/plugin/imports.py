@@ -63,8 +63,6 @@ def few_imports() -> Iterator[None]:
         sys.modules[COMPILER] = torch._dynamo = _Compiler(COMPILER)
     # Nerfstudio has this on Windows. It compiles a function that we do not call.
     misc.torch_compile = lambda *_, **__: lambda function: function
-    # As torch documents it. Its own asks the compiler.
-    torch.broadcast_shapes = lambda *shapes: torch.broadcast_tensors(*map(torch.empty(()).expand, shapes))[0].shape
     try:
         yield
     finally:

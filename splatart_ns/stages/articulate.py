@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -82,7 +83,7 @@ def forward_kinematics(
         observed = tree.observed().to(q)
         q = q.clamp(observed.amin(0), observed.amax(0))
     root = torch.eye(4).to(q) if root_motion is None else root_motion.to(q)
-    root = root.expand(*torch.broadcast_shapes(root.shape[:-2], q.shape[:-1]), 4, 4)
+    root = root.expand(*np.broadcast_shapes(root.shape[:-2], q.shape[:-1]), 4, 4)  # see from_rotation_translation
     motions = {tree.root: root}
     values = {id(j): v for j, v in zip(movable, q.split(dofs, -1), strict=True)}
     for joint in tree.joints:
