@@ -141,7 +141,7 @@ def _serve(source: BinaryIO, tell: Callable[[str, Any], None]) -> None:
 def _receive(source: BinaryIO, runs: queue.SimpleQueue) -> None:
     try:
         while True:
-            runs.put(pickle.load(source))
+            runs.put(pickle.load(source))  # of the process that started this one, by a pipe that no other has
     except EOFError:
         os._exit(1)
 

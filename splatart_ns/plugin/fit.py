@@ -192,7 +192,7 @@ def fit(
     configs = stage_configs(capture, output_dir, settings)
     pose, joint = (configs.pop(name) for name in ("pose", "joint"))
     with _progress() as progress:
-        _train(configs, rasterizer, report, progress, companions or Companions())
+        _train(configs, rasterizer, report, progress, companions)
         _train({"pose": pose}, rasterizer, report, progress)
         _train({"joint": joint}, rasterizer, report, progress, whole=_is_whole(output_dir))
     return output_dir

@@ -51,7 +51,7 @@ def refine_poses(
     T = T.clone()
     S, P = T.shape[:2]
     covariances = torch.zeros(S, P, 6, 6, dtype=torch.float64, device=T.device)
-    something_rests = bool(frozen[1:].all(0).any())
+    something_rests = bool(frozen.all(0).any())
     for p in range(P):
         refined, slides = 0, {}
         for s in range(1, S):

@@ -74,6 +74,8 @@ def refine_known_poses(
     S, P = T.shape[:2]
     M = since_reference(T, reference)
     covariances = torch.full((S, P, 6, 6), torch.nan, dtype=torch.float64, device=T.device)
+    frozen = frozen & known  # where no motion was found nothing is known to rest
+    frozen[list(reference), torch.arange(P)] = True
     for order, parts in _groups(reference, known):
         refined, certainty = refine_poses(*_chosen(splats, views, order, parts), M[order], frozen[order], central)
         for p in parts:

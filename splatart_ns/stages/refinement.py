@@ -160,14 +160,12 @@ def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | No
     return A @ local @ A.T
 
 
-def shifted(
-    pair: PartPair, T: Tensor, R: Tensor | None = None, max_iterations: int = 6, central: bool = False
-) -> Refinement:
+def shifted(pair: PartPair, T: Tensor, R: Tensor | None = None, central: bool = False) -> Refinement:
     """The best motion with the rotation R [3, 3], by default none, from where T [4, 4] puts the part's centroid."""
     R = torch.eye(3).to(T) if R is None else R.to(T)
     moved = transform_points(T, pair.centroid[None])[0]
     start = from_rotation_translation(R, moved - R @ pair.centroid)
-    return refine(pair, start, max_iterations, hold_rotation=True, central=central)
+    return refine(pair, start, hold_rotation=True, central=central)
 
 
 def rotation_held_ratio(pair: PartPair, T: Tensor, R: Tensor) -> float:

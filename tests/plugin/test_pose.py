@@ -72,6 +72,15 @@ def test_poses_start_from_a_file_in_the_captures_unit(pose_trainer, capture_dir,
     assert torch.allclose(model.poses.T()[1, :, 0, 3], torch.tensor(0.25 * capture.normalization.scale).double())
 
 
+def test_gaussians_that_no_view_shows_are_left_out(pose_trainer, monkeypatch):
+    def last_seen(splat, views):
+        return (torch.arange(len(splat)) == len(splat) - 1).float()
+
+    monkeypatch.setattr("splatart_ns.plugin.pose.clearest", last_seen)
+    model = pose_trainer(init="centroids").pipeline.model
+    assert [len(model.state_splat(state)) for state in (0, 1)] == [1, 1]
+
+
 def test_a_missing_file_is_named(pose_trainer):
     with pytest.raises(InputError, match="init-file"):
         pose_trainer(init="file")

@@ -64,6 +64,19 @@ def test_a_part_that_state_0_hides_is_found_in_the_others_and_unknown_there(scen
     assert torch.cdist(merged[1].means, goal).amin(1).max() < 0.05
 
 
+@pytest.mark.parametrize("found", [True, False])
+def test_a_slide_is_held_unturned_where_a_part_is_known_to_rest(found):
+    """The base stays where it is: because it rests, or because no motion of it was found."""
+    slide = motion((0, 0, 0), (0.2, 0.1, 0.0))
+    splats = [Splat.cat([BASE, PLATE.transformed(T)]) for T in (EYE, slide)]
+    T = EYE.repeat(2, 2, 1, 1)
+    T[1, 1] = nearby(slide, 0.01)
+    frozen, known = torch.tensor([[False, False], [True, False]]), torch.tensor([[True, True], [found, True]])
+    T, _, _ = refine_known_poses(splats, [photograph(s, 8) for s in splats], T, frozen, [0, 0], known)
+    assert torch.equal(T[1, 1, :3, :3], EYE[:3, :3]) == found
+    assert angle_deg(T[1, 1], slide) < 0.5
+
+
 def test_a_pose_at_state_0_that_is_sure_turns_motions_into_those_since_state_0(scene):
     splats, views = scene
     splats = [Splat.cat([BASE, PLATE]), *splats[1:]]
