@@ -206,7 +206,7 @@ def test_render_looks_through_a_camera_of_the_capture(render, hinge_capture, tmp
 
 
 def test_a_dataset_is_a_capture_without_problems(run_main, hinge_fit, tmp_path):
-    folder = tmp_path / "capture"  # of 12 frames a state: the hull of 8 is too crude to judge labels by
+    folder = tmp_path / "capture"
     code, output, errors = run_main("render", hinge_fit, "--dataset", 36, "--states", 3, "--output", folder, *SMALL)
     assert (code, errors) == (0, "") and f"Capture: {folder}" in output
     assert [len(state.frames) for state in load_capture(folder).states] == [12, 12, 12]

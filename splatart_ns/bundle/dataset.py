@@ -55,7 +55,8 @@ class Dataset:
     """Samples by number, 0 and up without end: the same object, options and number give the same sample.
 
     Every joint's observed range is cut into as many pieces as there are states, and each state has a value from another
-    piece, so that few states differ and many cover the range (a Latin hypercube). A joint's freedoms are drawn apart.
+    piece, at the same place of each, so that any two states differ by a piece at least and many cover the range (a
+    Latin hypercube, evenly spaced). A joint's freedoms are drawn apart.
     """
 
     def __init__(self, splat: ArticulatedSplat, options: DatasetOptions | None = None):
@@ -76,7 +77,7 @@ class Dataset:
             rng = np.random.default_rng([self.options.seed, 0, number])
             observed = joint.values.reshape(len(joint.values), -1).numpy()
             low, high = observed.min(0), observed.max(0)
-            places = np.stack([rng.permutation(states) for _ in low], -1) + rng.uniform(size=(states, len(low)))
+            places = np.stack([rng.permutation(states) for _ in low], -1) + rng.uniform(size=len(low))
             values = (low + (high - low) * places[state] / states).tolist()
             q[name] = values if len(values) > 1 else values[0]
         return q

@@ -52,6 +52,7 @@ def test_each_state_has_values_from_another_piece_of_the_observed_range(splat):
         low, high = joint.limits
         values = np.array([many.configuration(k)[name] for k in range(states)])
         assert sorted(np.floor((values - low) / (high - low) * states).astype(int)) == list(range(states))
+        assert np.diff(sorted(values)).min() > 0.999 * (high - low) / states  # no two states are nearly the same
     hinge, slide = ([many.configuration(k)[name] for k in range(states)] for name in ("hinge", "slide"))
     assert abs(np.corrcoef(hinge, slide)[0, 1]) < 0.7
 
