@@ -29,9 +29,11 @@ _WRONG_PART, _WRONG_OBJECT = 0.6, 0.3
 """A frame's labels are wrong where it contradicts the others on so much of a part, or of all parts together, which are
 so many points:"""
 _ENOUGH_POINTS = 30
-_ENOUGH_BALLOTS = 16
-"""With fewer labelled frames the hull is too crude for the stricter limit of all parts together: right labels of an
-open hinge contradict each other on up to 32 % with 12 frames, 21 % with 16, 15 % with 20."""
+_ENOUGH_BALLOTS = 10
+"""With fewer labelled frames the votes are too few for the stricter limit of all parts together,"""
+_ENOUGH_VIEWS = 16
+"""and with fewer silhouettes the hull is too crude: right labels of an open hinge contradict each other on up to 32 %
+with 12 frames, 21 % with 16, 15 % with 20."""
 _MOST_WRONG = 30
 """So many wrong frames are named of each state."""
 _WIDE_BAND, _SHIFTED_BAND = 0.02, 0.02
@@ -260,7 +262,8 @@ def _check_votes(capture: Capture, one: _Evidence) -> Iterator[Problem]:
         ]
         if number.sum() >= _ENOUGH_POINTS:
             whole = float((share * number).sum() / number.sum())
-            limit = _WRONG_OBJECT if len(one.votes.ballots) >= _ENOUGH_BALLOTS else _WRONG_PART
+            strict = len(one.votes.ballots) >= _ENOUGH_BALLOTS and len(one.views) >= _ENOUGH_VIEWS
+            limit = _WRONG_OBJECT if strict else _WRONG_PART
             known.append((whole / limit, whole, "object"))
         return max(known, default=(0.0, 0.0, ""))
 

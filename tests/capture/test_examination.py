@@ -7,6 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatart_ns.capture.examination import as_json, as_text, examine
+from splatart_ns.capture.procedural import synthesize_object
+from splatart_ns.capture.synthesis_options import SynthesisOptions
 
 
 @pytest.fixture
@@ -124,6 +126,21 @@ def test_a_defect_is_told_and_its_frame_named(capture, name):
     assert all(p.mend for p in problems)
     blamed = {str(p.file.relative_to(capture)) for p in problems if p.file.suffix == ".png"}
     assert blamed <= set(expected)
+
+
+def swapped_at_the_left(labels):
+    """Swapped on less than half of each part."""
+    columns = np.nonzero((labels > 0).any(0))[0]
+    left = np.arange(labels.shape[1]) < 0.6 * columns[0] + 0.4 * columns[-1]
+    return np.where(left, swapped(labels), labels)
+
+
+def test_a_frame_that_is_partly_wrong_is_named_where_many_silhouettes_make_a_sharp_hull(tmp_path):
+    options = SynthesisOptions(train_views=16, test_views=2, resolution=64)
+    capture = synthesize_object("hinge", tmp_path / "capture", options)
+    change_png(capture / LABELS, swapped_at_the_left)
+    problems = examine(capture).problems
+    assert [p.file for p in problems] == [capture / LABELS], problems
 
 
 def test_a_sound_capture_has_no_problems_and_its_parts_are_counted(hinge_capture):
