@@ -164,6 +164,15 @@ def wheel(palette: Palette, mark: bool, rim: bool) -> ArticulatedObject:
     return linked("wheel", 0.05, [joint], stand=(_GREEN, stand), disc=(palette, disc))
 
 
+def knob(sides: int) -> ArticulatedObject:
+    """A plain prism of so many sides on a textured stand, which looks the same after a turn by 1 / sides."""
+    stand = [box((-0.15, -0.25, 0.0), (0.1, 0.15, 0.03)), box((-0.1, -0.24, 0.02), (-0.02, 0.24, 0.6))]
+    ring = 0.17 * np.array([(0.0, math.cos(a), math.sin(a)) for a in np.arange(sides) * 2 * math.pi / sides])
+    prism = trimesh.convex.convex_hull(np.concatenate([ring + (0.01, 0.0, 0.0), ring + (0.09, 0.0, 0.0)]))
+    joint = Joint("knob_joint", "revolute", "stand", "knob", (0.0, 0.0, 0.35), (1, 0, 0), (-3.2, 3.2))
+    return linked("knob", 0.05, [joint], stand=(_GREEN, stand), knob=(_PLAIN, [prism, drum(0.04, -0.018, 0.02, "x")]))
+
+
 def button() -> ArticulatedObject:
     """A panel with a sliding and a turning part of a few pixels."""
     panel = [box((-0.05, -0.4, 0.0), (0.0, 0.4, 0.5)), box((-0.2, -0.3, 0.0), (0.1, 0.3, 0.04))]
@@ -253,6 +262,9 @@ CASES: dict[str, Case] = {
     "textured disc about its axis": Case(lambda: wheel(_BLUE, False, False), ("disc_joint=0", "disc_joint=1.2")),
     "disc with a mark": Case(lambda: wheel(_PLAIN, True, False), ("disc_joint=0", "disc_joint=1.2")),
     "plain disc about its rim": Case(lambda: wheel(_PLAIN, False, True), ("disc_joint=0", "disc_joint=1.2")),
+    "plain square knob": Case(lambda: knob(4), ("knob_joint=0", "knob_joint=0.4")),
+    "plain hexagonal knob": Case(lambda: knob(6), ("knob_joint=0", "knob_joint=0.3")),
+    "plain square knob, 60 degrees": Case(lambda: knob(4), ("knob_joint=0", "knob_joint=1.0472")),
     "parts of a few pixels": Case(button, ("slider_joint=0.05,lever_joint=-0.6", "slider_joint=0.25,lever_joint=0.8")),
 }
 

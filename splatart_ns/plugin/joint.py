@@ -247,6 +247,7 @@ class JointPipeline(VanillaPipeline):
             method=config.method,
             constraints=parse_constraints(config.joints, capture.parts, root),
         )
+        self.tree = doubted(self.tree, state["_model.alike"])
         self.notes = [f"{capture.parts[part]}: {reason}" for part, reason in self.tree.unattached.items()]
         for note in self.notes:
             CONSOLE.log(note)
@@ -274,6 +275,14 @@ class JointPipeline(VanillaPipeline):
                 **({} if capture.worlds == "shared" else {"worlds": worlds.tolist()}),
             },
         )
+
+
+def doubted(tree: KinematicTree, alike: Tensor) -> KinematicTree:
+    """The tree with all joints called ambiguous of parts that may have turned quite otherwise, `alike` [P]."""
+    fits = [
+        replace(j.fit, ambiguous=j.fit.ambiguous or bool(alike[[j.parent - 1, j.child - 1]].any())) for j in tree.joints
+    ]
+    return replace(tree, joints=[replace(j, fit=fit) for j, fit in zip(tree.joints, fits, strict=True)])
 
 
 def surface_points(splat: Splat) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -20,6 +21,7 @@ from splatart_ns.bundle.motion_file import read_motions
 from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.view import View
 from splatart_ns.errors import InputError
+from splatart_ns.geometry.se3 import so3_log
 from splatart_ns.plugin.gaussians import gauss_params_from_splat
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.plugin.semantic_run import find_semantic_runs, read_state
@@ -28,7 +30,7 @@ from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
-from splatart_ns.stages.render_choice import initial_motion
+from splatart_ns.stages.render_choice import InitialMotion, initial_motion
 from splatart_ns.stages.unseen import may_have_turned
 from splatart_ns.stages.visibility import HIDDEN, clearest, visibility
 from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_views, world_record, world_sentence
@@ -60,6 +62,8 @@ class PoseModel(SplatartModel):
         self.register_buffer("merged", torch.tensor(False))
         self.register_buffer("covariance", torch.zeros(1, self.num_parts, 6, 6, dtype=torch.float64))
         self.register_buffer("held_ratio", torch.full((self.num_parts, self.num_parts), torch.nan))
+        # Parts that may have turned quite otherwise in some state.
+        self.register_buffer("alike", torch.zeros(self.num_parts, dtype=torch.bool))
         self.register_buffer("worlds", torch.eye(4, dtype=torch.float64)[None])
         eye = torch.eye(4, dtype=torch.float64).repeat(1, self.num_parts, 1, 1)
         self.poses = PartPoses(eye, torch.zeros(self.num_parts, 3), torch.ones(self.num_parts))
@@ -199,7 +203,17 @@ class PosePipeline(VanillaPipeline):
                 M[s, p] = motion.T.cpu()
                 self._known[s, p] = motion.found
                 self._frozen[s, p] = not motion.found or (snap and motion.still)
+                self.model.alike[p] |= len(motion.alike) > 0
+                self._note_alike(p, s, motion)
         return since_state_0(M, self._known)
+
+    def _note_alike(self, p: int, s: int, motion: InitialMotion) -> None:
+        """Say by which other turns the images show a part as well."""
+        if motion.alike:
+            turn, *others = (f"{math.degrees(so3_log(T[:3, :3]).norm()):.0f}" for T in (motion.T, *motion.alike))
+            part = f"part {self.model.part_names[p + 1]}, state {s}"
+            self.notes.append(f"{part}: turned by {turn} degrees; by {' or '.join(others)} it looks nearly the same.")
+            CONSOLE.log(self.notes[-1])
 
     def _note_unknown(self, known: Tensor) -> None:
         """Say which poses [S, P] of a part no image tells."""

@@ -178,6 +178,7 @@ def pose_state(merged: bool = True) -> dict[str, Tensor]:
         "_model.poses.base": base,
         "_model.covariance": covariance,
         "_model.held_ratio": torch.full((2, 2), torch.nan),
+        "_model.alike": torch.zeros(2, dtype=torch.bool),
         "_model.merged": torch.tensor(merged),
         "_model.worlds": torch.eye(4).double().repeat(len(base), 1, 1),
     }
@@ -197,6 +198,7 @@ def test_poses_become_a_joint_a_bundle_and_a_slider(tmp_path: Path, capture_dir:
     pipeline = joint_pipeline(tmp_path, capture_dir, pose_state(), root="lid")
     (joint,) = pipeline.bundle.joints
     assert (joint.type, joint.parent, joint.child) == ("revolute", "lid", "base")
+    assert not joint.ambiguous
     assert float(joint.values[1].abs()) == pytest.approx(DOOR, abs=1e-3)
     assert torch.allclose(joint.axis.abs(), torch.tensor([0.0, 0, 1]).double(), atol=1e-3)
     (slider,) = (slider for _, slider in parse_object(pipeline, ViewerSlider, ""))
@@ -206,6 +208,12 @@ def test_poses_become_a_joint_a_bundle_and_a_slider(tmp_path: Path, capture_dir:
     centre = normal.means[normal.part_ids == 1].double().mean(0) / pipeline.datamanager.capture.normalization.scale
     expected = centre + torch.from_numpy(pipeline.datamanager.capture.normalization.centre)
     assert torch.allclose(pipeline.bundle.parts[0].splat.means.double().mean(0), expected, atol=1e-5)
+
+
+def test_joints_of_a_part_that_may_have_turned_otherwise_are_ambiguous(tmp_path: Path, capture_dir: Path) -> None:
+    state = pose_state() | {"_model.alike": torch.tensor([False, True])}
+    (joint,) = joint_pipeline(tmp_path, capture_dir, state).bundle.joints
+    assert joint.ambiguous
 
 
 def test_an_unfinished_or_foreign_pose_run_is_refused(tmp_path: Path, capture_dir: Path) -> None:

@@ -71,6 +71,21 @@ def test_the_motion_of_a_part_is_found_from_splats_and_views(scene):
     assert angle_deg(found.T, TRUTH) < 0.3
     assert torch.allclose(found.T[:3, 3], TRUTH[:3, 3], atol=5e-3)
     assert found.identity_ratio > 3
+    assert found.alike == ()
+
+
+def test_the_other_turns_of_a_plain_square_part_are_told():
+    plate = box(2, (0.6, 0.6, 0.12), (0.0, 0.0, 0.2), spacing=0.05)
+    plate.sh = torch.zeros_like(plate.sh)
+    base = box(1, (0.9, 0.6, 0.3), (0.0, 0.0, -0.3))
+    T = motion((0, 0, 25), (0, 0, 0))
+    splats = (Splat.cat([base, plate]), Splat.cat([base, plate.transformed(T)]))
+    views = tuple(photograph(s) for s in splats)
+    seen = tuple(visibility(s, v) for s, v in zip(splats, views, strict=True))
+    found = initial_motion(splats, views, seen, part=2)
+    turns = [angle_deg(found.T, other) for other in found.alike]
+    assert any(abs(turn - 90) < 2 for turn in turns)
+    assert all(min(abs(turn - quarter) for quarter in (90, 180)) < 2 for turn in turns)
 
 
 def test_a_still_part_does_not_move_at_all(scene):
