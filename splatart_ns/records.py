@@ -23,7 +23,7 @@ class Record:
         self.fields: dict[str, Any] = value
 
     def fail(self, key: str, found: str, mend: str) -> NoReturn:
-        raise InputError(f"{self.path}: '{key}' of {self.where} {found}; {mend}".replace("\n", "\\n"))
+        raise InputError(f"{self.path}: '{key}' of {self.where} {found}; {mend}")
 
     def _get(self, key: str, kind: type | tuple[type, ...], word: str) -> Any:
         if key not in self.fields:

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import tarfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -48,18 +48,15 @@ def find_bundles(source: str) -> list[str]:
     Raises:
         InputError: there is none.
     """
-    storage = open_storage(source)
-
-    def below(path: str) -> Iterator[str]:
+    storage, found, paths = open_storage(source), [], [""]
+    while paths:
+        path = paths.pop()
         folders, files = storage.children(path)
         if _ARTICULATION in files:
-            yield path
-            return
-        for name in sorted(folders):
-            if not name.startswith("."):
-                yield from below(f"{path}/{name}" if path else name)
-
-    found = list(below(""))
+            found.append(path)
+            continue
+        inner = (name for name in sorted(folders, reverse=True) if not name.startswith("."))
+        paths += [f"{path}/{name}" if path else name for name in inner]
     if not found:
         raise InputError(f"{source}: there is no bundle in it; give the --output-dir of `splatart batch`.")
     return found
@@ -118,6 +115,9 @@ class Sharding:
         set_backend(self.rasterizer)
         pictures = self._write(work, work.folder / "images.tar")
         return {"images": work.entry.settings["count"], "thumbnails": pictures}, ["images.tar"]
+
+    def outcome_shape(self, stage: str) -> Any:
+        return {"digest": str} if stage == "read" else {"images": int, "thumbnails": [str]}
 
     def row(self, entry: Entry, outcomes: dict[str, dict[str, Any]]) -> dict[str, Any]:
         empty = {"parts": [], "joints": [], "failed_checks": []}

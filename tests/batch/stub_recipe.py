@@ -66,6 +66,9 @@ class StubRecipe:
                 log.write(f"{work.entry.name} {stage}\n")
         return result
 
+    def outcome_shape(self, stage):
+        return {"look": {"texts": dict}, "join": {"root": (str, None)}}.get(stage, dict)
+
     def row(self, entry, outcomes) -> dict[str, Any]:
         return {
             "parts": list(outcomes["look"]["texts"]),
