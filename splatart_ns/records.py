@@ -12,6 +12,8 @@ from torch import Tensor
 
 from splatart_ns.errors import InputError
 
+_MOST_BYTES = 256 << 20
+
 
 class Record:
     """A JSON object being read: typed access to its fields, with errors that name the place."""
@@ -58,6 +60,7 @@ class Record:
         return [Record(v, self.path, f"{key}[{i}]" + (f" ({n})" if n else "")) for i, (n, v) in enumerate(named)]
 
     def number(self, key: str) -> float:
+        """Below 1e18, as are the numbers of `tensor` and `motions`: their squares are float32 numbers."""
         return float(self.numbers(key, self._get(key, (int, float), "a number"), ()))
 
     def tensor(self, key: str, shape: tuple[int, ...]) -> Tensor:
@@ -82,14 +85,14 @@ class Record:
         if not orthonormal or not (torch.linalg.det(R) > 0).all() or not (T[:, 3] == bottom).all():
             self.fail(key, f"has a matrix that is no {kind}", "give [R t; 0 0 0 1]")
 
-    def numbers(self, key: str, value: Any, shape: tuple[int, ...]) -> Tensor:
-        """Nested lists of exactly this shape, all finite numbers, as float64."""
+    def numbers(self, key: str, value: Any, shape: tuple[int, ...], most: float = 1e18) -> Tensor:
+        """Nested lists of exactly this shape, all numbers of a size below `most`, as float64."""
 
         def check(v: Any, dims: tuple[int, ...]) -> None:
             if dims and isinstance(v, list) and len(v) == dims[0]:
                 for item in v:
                     check(item, dims[1:])
-            elif dims or isinstance(v, bool) or not isinstance(v, int | float) or not abs(v) < 1e300:
+            elif dims or isinstance(v, bool) or not isinstance(v, int | float) or not abs(v) < most:
                 self.fail(key, f"holds {_shown(v)}", f"give finite numbers of shape {list(shape)}")
 
         check(value, shape)
@@ -106,6 +109,8 @@ def read_record(path: Path, mend: str) -> Record:
     if os.path.exists(path) and not os.path.isfile(path):  # a pipe would never end
         raise InputError(f"{path}: is not a file; {mend}")
     try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise InputError(f"{path}: is larger than {_MOST_BYTES >> 20} MiB; {mend}")
         value = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_constant)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {mend}") from error

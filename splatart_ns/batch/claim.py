@@ -11,10 +11,10 @@ import time
 import uuid
 from urllib.parse import quote
 
-from splatart_ns.batch.shape import NUMBER, parse
 from splatart_ns.batch.storage import Storage
 from splatart_ns.errors import InputError
 from splatart_ns.machine import process_lives
+from splatart_ns.shape import NUMBER, parse
 
 _CLAIMS, _SESSIONS = ".batch/claims", ".batch/sessions"
 _BEAT = 20.0

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatart_ns.batch.entry import Entry
-from splatart_ns.batch.shape import NUMBER
 from splatart_ns.batch.stage import Needs, Stage, Work, fingerprint, stage_key
 from splatart_ns.errors import InputError
 from splatart_ns.files import write_json
+from splatart_ns.shape import NUMBER
 
 # What a stage needs is imported when it runs: the process that only hands out stages starts at once and stays small.
 if TYPE_CHECKING:

@@ -19,10 +19,10 @@ from typing import Any, Literal, Protocol
 from urllib.parse import quote
 
 from splatart_ns.batch.entry import Entry
-from splatart_ns.batch.shape import NUMBER, has_shape, parse
 from splatart_ns.batch.storage import FileInfo, Folder, Storage, open_storage, publish
 from splatart_ns.errors import InputError
 from splatart_ns.machine import process_lives
+from splatart_ns.shape import NUMBER, has_shape, parse
 
 _SCRATCH = "splatart-batch-"
 MARKERS = "stages"

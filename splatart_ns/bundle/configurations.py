@@ -110,6 +110,8 @@ def _sweep_values(joint: Joint, start: float | list[float], frames: int) -> list
 def read_trajectory(path: Path, bundle: Bundle) -> list[Configuration]:
     """Configurations from a CSV file: a header of joint names, then a row of values (see `parse_value`) per frame."""
     try:
+        if Path(path).exists() and not Path(path).is_file():  # a pipe would never end
+            raise InputError(f"{path}: is not a file; give a CSV file")
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
             rows = [(i, row) for i, row in enumerate(csv.reader(file), start=1) if any(cell.strip() for cell in row)]
     except OSError as error:

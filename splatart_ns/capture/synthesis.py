@@ -110,8 +110,9 @@ def _frozen(robot: Robot, options: SynthesisOptions) -> dict[str, float]:
     for text in options.freeze:
         frozen.update(_assignments(text, robot))
     values = robot.complete(frozen)
-    for _ in robot.movable:
-        frozen.update({j.name: values[j.name] for j in robot.movable if j.mimic and j.mimic.joint in frozen})
+    followers = [j for j in robot.movable if j.mimic is not None]
+    while new := {j.name: values[j.name] for j in followers if j.mimic.joint in frozen and j.name not in frozen}:
+        frozen.update(new)
     return frozen
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import platform
 import shutil
 import time
@@ -33,6 +32,7 @@ from splatart_ns.plugin.companion import Companions, Outcome
 from splatart_ns.plugin.semantic import RefineCameras
 from splatart_ns.plugin.stage_run import num_processes, run_side_by_side, run_stage
 from splatart_ns.rasterize.rasterization import Backend, default_backend, set_backend
+from splatart_ns.shape import NUMBER, has_shape, parse
 from splatart_ns.stages.joint_constraint import parse_constraints
 
 Quality = Literal["draft", "standard", "high"]
@@ -61,6 +61,9 @@ EFFORTS: dict[Quality, Effort] = {
 }
 SMALLEST = 128
 """Along the shorter side of images that are made smaller."""
+
+
+_REPORT = {"stages": [{"name": str, "seconds": NUMBER}], "settings": dict}
 
 
 @dataclass(frozen=True)
@@ -109,28 +112,21 @@ class Report:
 
     def _read_stages(self) -> list[dict[str, Any]]:
         """What an earlier run has finished, when it was of the same capture and settings."""
-        try:
-            earlier = json.loads(self.path.read_text())
-            stages = [
-                {
-                    **entry,
-                    "name": str(entry["name"]),
-                    "wall_seconds": entry.get("wall_seconds", entry["seconds"]) + 0.0,  # versions before had no other
-                }
-                for entry in earlier["stages"]
-            ]
-            had, wanted = earlier["settings"], self.data["settings"]
-            same = all(earlier.get(key) == self.data[key] for key in ("capture", "capture_sha256"))
-            last = ("root", "joints") if wanted["worlds"] == "shared" else ("joints",)  # the last stage alone asks
-            same = same and {k: v for k, v in had.items() if k not in last} == {
-                k: v for k, v in wanted.items() if k not in last
-            }
-            if any(had.get(k) != wanted[k] for k in last):
-                stages = [stage for stage in stages if stage["name"] != "joint"]
-        except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        earlier = parse(self.path.read_bytes() if self.path.is_file() else None, _REPORT) or {"stages": None}
+        # Versions before had seconds alone.
+        stages = [{"wall_seconds": entry["seconds"], **entry} for entry in earlier["stages"] or ()]
+        if earlier["stages"] is None or not has_shape(stages, [{"wall_seconds": NUMBER}]):
             raise InputError(
                 f"{self.path} is not a report of `splatart fit`; remove it or choose another --output-dir."
-            ) from None
+            )
+        had, wanted = earlier["settings"], self.data["settings"]
+        same = all(earlier.get(key) == self.data[key] for key in ("capture", "capture_sha256"))
+        last = ("root", "joints") if wanted["worlds"] == "shared" else ("joints",)  # the last stage alone asks
+        same = same and {k: v for k, v in had.items() if k not in last} == {
+            k: v for k, v in wanted.items() if k not in last
+        }
+        if any(had.get(k) != wanted[k] for k in last):
+            stages = [stage for stage in stages if stage["name"] != "joint"]
         if not same:
             CONSOLE.print(f"{self.path.parent} holds a fit of another capture or with other settings; starting over.")
         return stages if same else []

@@ -25,7 +25,7 @@ from splatart_ns.capture.capture import Normalization
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import se3_exp, se3_log
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint
-from splatart_ns.plugin.gaussians import gauss_params_from_splat, splat_from_state
+from splatart_ns.plugin.gaussians import SPLAT_SHAPES, gauss_params_from_splat, splat_from_state
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
@@ -36,6 +36,10 @@ from splatart_ns.stages.pose import carry
 from splatart_ns.stages.tree import EPSILON, JointMethod, infer_tree
 from splatart_ns.stages.unseen import known_states, place_unseen
 
+_POSE_SHAPES = {
+    **{"_model.merged": (), "_model.poses.base": ("S", "P", 4, 4), "_model.covariance": ("S", "P", 6, 6)},
+    **{"_model.held_ratio": ("P", "P"), "_model.worlds": ("S", 4, 4)},
+}
 JOINT_TYPES = tuple(JOINT_DOFS)
 MIN_POINT_OPACITY = 0.3
 """Fainter Gaussians say little of where a part's surface is."""
@@ -207,9 +211,9 @@ class JointPipeline(VanillaPipeline):
         capture = self.datamanager.capture
         normalization = capture.normalization
         run = config.pose_run or find_pose_run(capture.path)
-        state = read_checkpoint(run)
+        state = read_checkpoint(run, SPLAT_SHAPES | _POSE_SHAPES)
         shape = (len(capture.states), len(capture.parts))
-        if "_model.merged" not in state or state["_model.poses.base"].shape[:2] != shape or not state["_model.merged"]:
+        if state["_model.poses.base"].shape[:2] != shape or not state["_model.merged"]:
             raise InputError(
                 f"{run} is no finished splatart-pose run on a capture of {shape[0]} states and {shape[1]} parts; "
                 f"run `ns-train splatart-pose --data {capture.path}` again."

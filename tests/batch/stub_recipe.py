@@ -67,7 +67,8 @@ class StubRecipe:
         return result
 
     def outcome_shape(self, stage):
-        return {"look": {"texts": dict}, "join": {"root": (str, None)}}.get(stage, dict)
+        shapes = {"look": {"texts": {"one": str, "two": str}}, "join": {"root": (str, None)}}
+        return shapes.get(stage, dict)
 
     def row(self, entry, outcomes) -> dict[str, Any]:
         return {
