@@ -184,9 +184,10 @@ def read_urdf(path: Path) -> Robot:
             if material is not None and material.find("color") is None and material.get("name") in colours:
                 material.append(colours[material.get("name")].find("color"))
         links[name] = visuals
-    joints = tuple(_joint(e, path) for e in robot.findall("joint"))
-    if max(len(links), len(joints)) > _MOST_LINKS:
-        raise InputError(f"{path}: has {len(links)} links and {len(joints)} joints; give at most {_MOST_LINKS}.")
+    elements = robot.findall("joint")
+    if max(len(links), len(elements)) > _MOST_LINKS:
+        raise InputError(f"{path}: has {len(links)} links and {len(elements)} joints; give at most {_MOST_LINKS}.")
+    joints = tuple(_joint(element, path) for element in elements)
     return Robot(path, robot.get("name", path.stem), links, joints, _root(links, joints, path))
 
 
@@ -241,7 +242,8 @@ def _root(links: Mapping[str, object], joints: tuple[Joint, ...], path: Path) ->
             if link not in links:
                 raise InputError(f"{path}: joint {joint.name!r} names the link {link!r}, which is not there; add it.")
         if joint.mimic is not None and joint.mimic.joint not in movable:
-            raise InputError(f"{path}: joint {joint.name!r} mimics {joint.mimic.joint!r}, which is no movable joint.")
+            found = f"joint {joint.name!r} mimics {joint.mimic.joint!r}, which is no movable joint"
+            raise InputError(f"{path}: {found}; name one that is.")
     _check_mimics(joints, path)
     parents = Counter(j.child for j in joints)
     for link, count in parents.items():
