@@ -12,6 +12,8 @@ from torch import Tensor
 
 from splatart_ns.errors import InputError
 
+LONGEST = 1e18
+"""Numbers are below it, so that their squares are float32 numbers."""
 _MOST_BYTES = 256 << 20
 
 
@@ -60,7 +62,6 @@ class Record:
         return [Record(v, self.path, f"{key}[{i}]" + (f" ({n})" if n else "")) for i, (n, v) in enumerate(named)]
 
     def number(self, key: str) -> float:
-        """Below 1e18, as are the numbers of `tensor` and `motions`: their squares are float32 numbers."""
         return float(self.numbers(key, self._get(key, (int, float), "a number"), ()))
 
     def tensor(self, key: str, shape: tuple[int, ...]) -> Tensor:
@@ -85,7 +86,7 @@ class Record:
         if not orthonormal or not (torch.linalg.det(R) > 0).all() or not (T[:, 3] == bottom).all():
             self.fail(key, f"has a matrix that is no {kind}", "give [R t; 0 0 0 1]")
 
-    def numbers(self, key: str, value: Any, shape: tuple[int, ...], most: float = 1e18) -> Tensor:
+    def numbers(self, key: str, value: Any, shape: tuple[int, ...], most: float = LONGEST) -> Tensor:
         """Nested lists of exactly this shape, all numbers of a size below `most`, as float64."""
 
         def check(v: Any, dims: tuple[int, ...]) -> None:

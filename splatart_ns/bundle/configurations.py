@@ -11,7 +11,7 @@ import numpy as np
 
 from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
 from splatart_ns.errors import InputError
-from splatart_ns.records import read_record
+from splatart_ns.records import LONGEST, read_record
 
 Configuration = dict[str, float | list[float]]
 """Joint name to value, radian or length, or to as many as the joint has freedoms (`Joint.values`); joints that are not
@@ -63,7 +63,7 @@ def _parse_number(number: str, joint: Joint, is_length: bool, where: str) -> flo
         value = float(number[:-3] if degrees else number)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
+    if not abs(value) < LONGEST:
         raise InputError(f"{where}: '{number}' for joint '{joint.name}' is no number; write 0.5 or 30deg")
     return math.radians(value) if degrees else value
 

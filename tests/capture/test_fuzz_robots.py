@@ -9,7 +9,7 @@ import zipfile
 import numpy as np
 import pytest
 import trimesh
-from fuzzing import EXAMPLES, STRANGE, damaged_bytes, fuzzed
+from fuzzing import STRANGE, damaged_bytes, fuzzed
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -79,7 +79,7 @@ def test_any_urdf(folder, data):
 
 
 @given(data=damaged_urdf())
-@lambda test: fuzzed(test, max(10, EXAMPLES // 10))
+@fuzzed
 def test_any_urdf_is_rendered(folder, data):
     (folder / "robot.urdf").write_bytes(data)
     options = SynthesisOptions(train_views=1, test_views=0, resolution=8, samples=1)
@@ -164,9 +164,9 @@ def test_values_of_a_urdf_that_make_no_sense_are_named(folder, old, new, words):
 
 
 def test_a_urdf_of_very_many_links_is_refused_at_once(tmp_path):
-    links = "".join(f'<link name="l{i}"/>' for i in range(100_001))
+    links = "".join(f'<link name="l{i}"/>' for i in range(10_001))
     joint = '<joint name="j{}" type="fixed"><parent link="l{}"/><child link="l{}"/></joint>'
-    joints = "".join(joint.format(i, i, i + 1) for i in range(100_000))
+    joints = "".join(joint.format(i, i, i + 1) for i in range(10_000))
     (tmp_path / "robot.urdf").write_text(f"<robot>{links}{joints}</robot>")
-    with pytest.raises(InputError, match="100001 links"):
+    with pytest.raises(InputError, match="10001 links"):
         read_urdf(tmp_path / "robot.urdf")
