@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.stage import Needs, Stage, Work, stage_key
 from splatart_ns.batch.storage import Storage, open_storage
+from splatart_ns.capture.synthesis_options import MOST_PIXELS
 from splatart_ns.errors import InputError
 
 if TYPE_CHECKING:
@@ -69,6 +70,8 @@ class Shards(Sequence[Entry]):
         for name in ("images", "shard_size", "states"):
             if (value := getattr(options, name)) < 1:
                 raise InputError(f"--{name.replace('_', '-')} is {value}; give 1 or more.")
+        if not 8 <= options.resolution <= MOST_PIXELS:
+            raise InputError(f"--resolution is {options.resolution}; give 8 to {MOST_PIXELS}.")
         self._url, self._bundles, self._options = open_storage(source).url, bundles, options
 
     def __len__(self) -> int:

@@ -23,6 +23,7 @@ from splatart_ns.bundle import load_bundle
 from splatart_ns.capture.capture import Capture, Worlds
 from splatart_ns.capture.check import require_valid
 from splatart_ns.capture.digest import capture_digest
+from splatart_ns.capture.values import is_inside
 from splatart_ns.errors import InputError
 from splatart_ns.files import write_json
 from splatart_ns.method_configs.joint import method as joint_method
@@ -128,7 +129,8 @@ class Report:
         if any(had.get(k) != wanted[k] for k in last):
             stages = [stage for stage in stages if stage["name"] != "joint"]
         if not same:
-            CONSOLE.print(f"{self.path.parent} holds a fit of another capture or with other settings; starting over.")
+            found = f"{self.path.parent} holds a fit of another capture or with other settings; starting over."
+            CONSOLE.print(found, markup=False)
         return stages if same else []
 
     def resume(self, stage: str, whole: bool) -> bool:
@@ -175,6 +177,8 @@ def fit(
     set_backend(rasterizer)
     settings = Settings(quality, root, seed, rasterizer, list(joints), worlds, refine_cameras)
     capture = require_fittable(capture_path, settings)
+    if is_inside(capture_path, output_dir):
+        raise InputError(f"{output_dir} lies in the capture; choose another --output-dir, beside it.")
     output_dir = output_dir.absolute()
     report = Report(output_dir / "report.json", capture, settings)
     try:
@@ -349,7 +353,7 @@ def _progress() -> Iterator[Progress]:
     try:
         with Progress(
             SpinnerColumn(),
-            TextColumn("{task.description:<24}"),
+            TextColumn("{task.description:<24}", markup=False),
             BarColumn(),
             TextColumn("{task.completed:.0f}/{task.total:.0f}"),
             TimeElapsedColumn(),

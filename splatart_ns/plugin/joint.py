@@ -253,7 +253,7 @@ class JointPipeline(VanillaPipeline):
         )
         self.notes = [f"{capture.parts[part]}: {reason}" for part, reason in self.tree.unattached.items()]
         for note in self.notes:
-            CONSOLE.log(note)
+            CONSOLE.log(note, markup=False)
         if not all(bool(states.all()) for states in known.values()):
             places, part_motions, _ = place_unseen(self.tree, part_motions, known)
             motions = torch.stack([part_motions[p] for p in sorted(capture.parts)], dim=1)
@@ -341,7 +341,7 @@ class JointTrainer(Trainer):
         folder = self.config.bundle_dir or self.base_dir / "bundle"
         save_bundle(self.pipeline.bundle, folder)
         self.save_checkpoint(self.step)
-        CONSOLE.print(f"Bundle: {folder}\nConfig: {self.base_dir / 'config.yml'}")
+        CONSOLE.print(f"Bundle: {folder}\nConfig: {self.base_dir / 'config.yml'}", markup=False)
         self._init_viewer_state()
         self.pipeline.eval()
         if not self.config.viewer.quit_on_train_completion:
