@@ -94,10 +94,13 @@ def run_setting(config: Path, *names: str) -> Any:
     return value
 
 
-def read_checkpoint(config: Path, shapes: Mapping[str, Sequence[int | str]]) -> dict[str, torch.Tensor]:
+def read_checkpoint(
+    config: Path, shapes: Mapping[str, Sequence[int | str]], other: str | None = None
+) -> dict[str, torch.Tensor]:
     """The pipeline state of the newest checkpoint beside a run's config.yml.
 
-    `shapes` are those of the tensors that it must have: sizes, or letters that stand for the same size everywhere.
+    `shapes` are those of the tensors that it must have: sizes, or words that stand for the same size everywhere.
+    `other` is what to say of one that has them not.
 
     Raises:
         InputError: when there is none, it cannot be read, or has not these tensors.
@@ -117,12 +120,13 @@ def read_checkpoint(config: Path, shapes: Mapping[str, Sequence[int | str]]) -> 
         tensor = state.get(name) if isinstance(state, dict) else None
         if not isinstance(tensor, torch.Tensor) or not _has_sizes(tensor, shape, sizes):
             wanted = ", ".join(map(str, shape))
-            raise InputError(f"{files[-1]} has no '{name}' of the shape [{wanted}]; train that stage again.")
+            found = f"{files[-1]} has no '{name}' of the shape [{wanted}]"
+            raise InputError(other or f"{found}; train that stage again.")
     return state
 
 
 def _has_sizes(tensor: torch.Tensor, shape: Sequence[int | str], sizes: dict[str, int]) -> bool:
-    """Whether a tensor has this shape; `sizes` are those of the letters that are known, and gets the others."""
+    """Whether a tensor has this shape; `sizes` are those of the words that are known, and gets the others."""
     if tensor.ndim != len(shape) or tensor.layout is not torch.strided:
         return False
     pairs = zip(shape, tensor.shape, strict=True)

@@ -36,10 +36,6 @@ from splatart_ns.stages.pose import carry
 from splatart_ns.stages.tree import EPSILON, JointMethod, infer_tree
 from splatart_ns.stages.unseen import known_states, place_unseen
 
-_POSE_SHAPES = {
-    **{"_model.merged": (), "_model.poses.base": ("S", "P", 4, 4), "_model.covariance": ("S", "P", 6, 6)},
-    **{"_model.held_ratio": ("P", "P"), "_model.worlds": ("S", 4, 4)},
-}
 JOINT_TYPES = tuple(JOINT_DOFS)
 MIN_POINT_OPACITY = 0.3
 """Fainter Gaussians say little of where a part's surface is."""
@@ -211,13 +207,14 @@ class JointPipeline(VanillaPipeline):
         capture = self.datamanager.capture
         normalization = capture.normalization
         run = config.pose_run or find_pose_run(capture.path)
-        state = read_checkpoint(run, SPLAT_SHAPES | _POSE_SHAPES)
         shape = (len(capture.states), len(capture.parts))
-        if state["_model.poses.base"].shape[:2] != shape or not state["_model.merged"]:
-            raise InputError(
-                f"{run} is no finished splatart-pose run on a capture of {shape[0]} states and {shape[1]} parts; "
-                f"run `ns-train splatart-pose --data {capture.path}` again."
-            )
+        other = (
+            f"{run} is no finished splatart-pose run on a capture of {shape[0]} states and {shape[1]} parts; "
+            f"run `ns-train splatart-pose --data {capture.path}` again."
+        )
+        state = read_checkpoint(run, SPLAT_SHAPES | _pose_shapes(*shape), other)
+        if not state["_model.merged"]:
+            raise InputError(other)
         splat = splat_from_state(state)
         ids = splat.part_ids
         world = splat_to_world(splat, normalization)
@@ -318,6 +315,14 @@ def find_pose_run(capture: Path) -> Path:
             f"first, or name its config.yml by --pipeline.pose-run."
         )
     return runs[-1]
+
+
+def _pose_shapes(S: int, P: int) -> dict[str, tuple[int, ...]]:
+    """Of what a splatart-pose run found about S states and P parts."""
+    return {
+        **{"_model.merged": (), "_model.poses.base": (S, P, 4, 4), "_model.covariance": (S, P, 6, 6)},
+        **{"_model.held_ratio": (P, P), "_model.worlds": (S, 4, 4)},
+    }
 
 
 @dataclass
