@@ -20,7 +20,7 @@ test: $(READY)
 	$(BIN)/pytest
 
 fuzz: $(READY)
-	SPLATART_FUZZ_EXAMPLES=2000 $(BIN)/pytest tests/capture/test_fuzz.py tests/bundle/test_fuzz.py
+	SPLATART_FUZZ_EXAMPLES=2000 $(BIN)/pytest tests/*/test_fuzz*.py
 
 # BENCH=--quick for minutes instead of hours; captures with ground truth may follow.
 bench: $(READY)

@@ -7,3 +7,11 @@ class InputError(Exception):
     The message is one sentence that names the file, the value found and how to mend it. Commands print it
     without a traceback and exit with code 2.
     """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
+
+
+def printable(text: str) -> str:
+    """A text on one line that leaves a terminal as it is, whatever names from outside are in it."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

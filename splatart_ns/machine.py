@@ -38,9 +38,11 @@ def num_gpus() -> int:
 
 def process_lives(pid: int) -> bool:
     """Whether a process of this machine runs."""
+    if pid <= 0:  # which would ask for a group of processes
+        return False
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:  # it is somebody else's
         return True

@@ -12,6 +12,10 @@ from torch import Tensor
 
 from splatart_ns.errors import InputError
 
+LONGEST = 1e18
+"""Numbers are below it, so that their squares are float32 numbers."""
+_MOST_BYTES = 256 << 20
+
 
 class Record:
     """A JSON object being read: typed access to its fields, with errors that name the place."""
@@ -23,7 +27,7 @@ class Record:
         self.fields: dict[str, Any] = value
 
     def fail(self, key: str, found: str, mend: str) -> NoReturn:
-        raise InputError(f"{self.path}: '{key}' of {self.where} {found}; {mend}".replace("\n", "\\n"))
+        raise InputError(f"{self.path}: '{key}' of {self.where} {found}; {mend}")
 
     def _get(self, key: str, kind: type | tuple[type, ...], word: str) -> Any:
         if key not in self.fields:
@@ -82,14 +86,14 @@ class Record:
         if not orthonormal or not (torch.linalg.det(R) > 0).all() or not (T[:, 3] == bottom).all():
             self.fail(key, f"has a matrix that is no {kind}", "give [R t; 0 0 0 1]")
 
-    def numbers(self, key: str, value: Any, shape: tuple[int, ...]) -> Tensor:
-        """Nested lists of exactly this shape, all finite numbers, as float64."""
+    def numbers(self, key: str, value: Any, shape: tuple[int, ...], most: float = LONGEST) -> Tensor:
+        """Nested lists of exactly this shape, all numbers of a size below `most`, as float64."""
 
         def check(v: Any, dims: tuple[int, ...]) -> None:
             if dims and isinstance(v, list) and len(v) == dims[0]:
                 for item in v:
                     check(item, dims[1:])
-            elif dims or isinstance(v, bool) or not isinstance(v, int | float) or not abs(v) < 1e300:
+            elif dims or isinstance(v, bool) or not isinstance(v, int | float) or not abs(v) < most:
                 self.fail(key, f"holds {_shown(v)}", f"give finite numbers of shape {list(shape)}")
 
         check(value, shape)
@@ -106,6 +110,8 @@ def read_record(path: Path, mend: str) -> Record:
     if os.path.exists(path) and not os.path.isfile(path):  # a pipe would never end
         raise InputError(f"{path}: is not a file; {mend}")
     try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise InputError(f"{path}: is larger than {_MOST_BYTES >> 20} MiB; {mend}")
         value = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_constant)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {mend}") from error

@@ -243,6 +243,37 @@ def test_bad_options_of_render_are_refused(refused, hinge_fit, tmp_path, argumen
     assert contents(tmp_path) == {}
 
 
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--resolution", 10**8], "--resolution is 100000000; give 16384 or less"),
+        (["--dataset", 10**12], "--dataset is 1000000000000; give at most 10000000 images"),
+        (["--dataset", 10**7, "--states", 10**11], "--states is 100000000000; give 100000 or less"),
+        (["--set", "base_to_lid=1e300"], "'1e300' for joint 'base_to_lid' is no number"),
+    ],
+    ids=str,
+)
+def test_what_no_memory_holds_is_refused_at_once(refused, hinge_fit, tmp_path, arguments, expected):
+    assert expected in refused("render", hinge_fit, "--output", tmp_path / "new", *arguments)
+    assert contents(tmp_path) == {}
+
+
+@pytest.mark.parametrize("name", ["a[/b] \x1b[2J\n", "[red]é", "a" * 200])
+def test_names_may_be_anything_that_a_folder_is_called(run_main, hinge_fit, tmp_path, name):
+    code, output, errors = run_main("render", hinge_fit, "--output", tmp_path / name, "--resolution", 16)
+    assert (code, errors) == (0, "") and "".join(name.split()) in "".join(output.split())
+    assert (tmp_path / name / "frame_0000.png").is_file()
+    code, _, errors = run_main("render", tmp_path / name, "--output", tmp_path / "new")
+    assert code == 2 and errors.count("\n") == 1 and "\x1b" not in errors
+
+
+def test_a_bundle_among_the_files_of_the_capture_is_refused(refused, capture):
+    before = contents(capture)
+    for output in (capture, capture / "state_00", capture / "state_01" / "new"):
+        assert "holds the capture's files" in refused("fit", capture, "--output-dir", output, "--quality", "draft")
+    assert contents(capture) == before
+
+
 @pytest.mark.parametrize("output", ["file", "file/new", "file/new.gif", "file/new.mp4", "new.webp"])
 def test_pictures_that_cannot_be_written_are_refused(refused, hinge_fit, tmp_path, output):
     (tmp_path / "file").write_text("mine")
@@ -267,6 +298,9 @@ def test_synth_refuses_what_it_cannot_read_or_write(refused, tmp_path):
     assert "robot.urdf" in refused("synth", tmp_path / "robot.urdf", "--output-dir", tmp_path / "new")
     assert "not empty" in refused("synth", "hinge", "--output-dir", tmp_path / "full")
     assert "cannot be written" in refused("synth", "hinge", "--output-dir", tmp_path / "full/file/new")
+    assert "states is 1000000000; give 1000 or less" in refused(
+        "synth", "hinge", "--output-dir", tmp_path / "new", "--states", 10**9
+    )
     assert "resolution is 0" in refused("synth", "hinge", "--output-dir", tmp_path / "new", "--resolution", 0)
     assert contents(tmp_path) == before
 

@@ -12,18 +12,20 @@ ROOT = Path(__file__).parents[1]
 BELOW = {
     "errors": set(),
     "machine": set(),
+    "plain_yaml": set(),
+    "shape": set(),
     "files": {"errors"},
     "records": {"errors"},
     "geometry": {"errors"},
     "splats": {"errors", "files", "geometry"},
     "rasterize": {"errors", "geometry", "splats"},
-    "capture": {"errors", "files", "geometry"},
+    "capture": {"errors", "files", "geometry", "plain_yaml"},
     "stages": {"capture", "errors", "geometry", "rasterize", "splats"},
 }
 BELOW["bundle"] = BELOW["stages"] | {"files", "records", "stages"}
 BELOW["evaluation"] = BELOW["bundle"] | {"bundle"}
 BELOW["viewer"] = BELOW["bundle"] | {"bundle"}
-BELOW["plugin"] = BELOW["bundle"] | {"bundle", "machine"}
+BELOW["plugin"] = BELOW["bundle"] | {"bundle", "machine", "plain_yaml", "shape"}
 BELOW["batch"] = BELOW["plugin"] | {"plugin"}
 BELOW["method_configs"] = {"plugin"}
 BELOW["cli"] = {"batch", "bundle", "capture", "errors", "evaluation", "plugin", "rasterize", "viewer"}

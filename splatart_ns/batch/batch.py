@@ -213,7 +213,7 @@ class _Batch:
     def _read(self, thing: _Object, files: dict[str, Any]) -> None:
         """Find out which stages have ended."""
         for name, stage in list(thing.waiting.items()):
-            marker = read_marker(self._out, thing.entry.name, name)
+            marker = read_marker(self._out, thing.entry.name, name, self._recipe.outcome_shape(name))
             if marker is None:
                 continue
             # A result counts when what it was made of does: a damaged one is made again, and what follows kept.

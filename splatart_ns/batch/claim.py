@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import threading
 import time
@@ -13,6 +14,7 @@ from urllib.parse import quote
 from splatart_ns.batch.storage import Storage
 from splatart_ns.errors import InputError
 from splatart_ns.machine import process_lives
+from splatart_ns.shape import NUMBER, parse
 
 _CLAIMS, _SESSIONS = ".batch/claims", ".batch/sessions"
 _BEAT = 20.0
@@ -77,14 +79,15 @@ class Session:
             if stem == quote(name, safe="") and number.isdecimal():
                 session = self._storage.read(f"{_CLAIMS}/{file}")
                 if session is not None:  # it may have been released since
-                    found[int(number)] = session.decode()
+                    found[int(number)] = session.decode(errors="replace")
         return found
 
     def _lives(self, session: str) -> bool:
-        data = self._storage.read(f"{_SESSIONS}/{session}.json")
-        if data is None:
+        if re.fullmatch("[0-9a-f]{32}", session) is None:  # no name that a session gave itself, but maybe a path
             return False
-        told = json.loads(data)
+        told = parse(self._storage.read(f"{_SESSIONS}/{session}.json"), {"host": str, "pid": int, "time": NUMBER})
+        if told is None:
+            return False
         if told["host"] == socket.gethostname() and not process_lives(told["pid"]):
             return False
         return time.time() - told["time"] < _DEAD

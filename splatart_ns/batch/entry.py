@@ -21,7 +21,7 @@ _MARKS = (
 """Files of captures in other layouts, see `capture.peer_layouts`."""
 _SETTINGS = ("quality", "root", "seed", "joints")
 _QUALITIES = ("draft", "standard", "high")
-_LONGEST_NAME = 150
+_LONGEST_NAME, _DEEPEST = 150, 100
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,8 @@ def _find(storage: Storage, settings: dict[str, Any]) -> list[Entry]:
 
 def _captures(storage: Storage, path: str) -> list[str] | None:
     """The folders at or below a path that look like a capture of one of the layouts; None for a state's folder."""
+    if path.count("/") > _DEEPEST:
+        raise InputError(f"{storage.url}/{path}: lies too deep; give a folder that is nearer to the captures.")
     folders, files = (set(names) for names in storage.children(path))
     if _TRANSFORMS in files:
         return [path] if _holds_states(storage.read(_join(path, _TRANSFORMS))) else None
@@ -114,7 +116,7 @@ def _csv_rows(source: str, text: str) -> Iterable[tuple[int, dict[str, Any]]]:
             row = {key.strip(): value.strip() for key, value in row.items() if value.strip()}
             if "joints" in row:
                 row["joints"] = [joint.strip() for joint in row["joints"].split(";")]
-            if row.get("seed", "").isdecimal():
+            if re.fullmatch("[0-9]{1,10}", row.get("seed", "")):
                 row["seed"] = int(row["seed"])
             yield reader.line_num, row
     except csv.Error as error:
@@ -122,7 +124,7 @@ def _csv_rows(source: str, text: str) -> Iterable[tuple[int, dict[str, Any]]]:
 
 
 def _json_rows(source: str, text: str) -> Iterable[tuple[int, dict[str, Any]]]:
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(text.split("\n"), 1):  # texts of JSON may hold other ends of lines
         if not line.strip():
             continue
         try:
@@ -137,7 +139,7 @@ def _json_rows(source: str, text: str) -> Iterable[tuple[int, dict[str, Any]]]:
 def _entry(where: str, row: dict[str, Any], folder: str, settings: dict[str, Any]) -> Entry:
     if unknown := set(row) - {"path", "name", *_SETTINGS}:
         known = ", ".join(("path", "name", *_SETTINGS))
-        raise InputError(f"{where}: '{sorted(unknown)[0]}' is unknown; known are {known}.")
+        raise InputError(f"{where}: {sorted(unknown)[0]!r} is unknown; known are {known}.")
     for key in ("path", "name", "root"):
         if key in row and not (isinstance(row[key], str) and row[key]):
             raise InputError(f"{where}: '{key}' is {row[key]!r}; give a text.")

@@ -15,6 +15,7 @@ from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.stage import Needs, Stage, Work, fingerprint, stage_key
 from splatart_ns.errors import InputError
 from splatart_ns.files import write_json
+from splatart_ns.shape import NUMBER
 
 # What a stage needs is imported when it runs: the process that only hands out stages starts at once and stays small.
 if TYPE_CHECKING:
@@ -26,6 +27,17 @@ _BYTES_PER_PIXEL = 60
 """Memory of a cached pixel of a training view, over all that a stage keeps of it."""
 _THUMBNAIL = 96
 """Rows and columns of a picture in the report."""
+
+
+_CHECK = {"digest": str, "states": [{"name": str, "digest": str, "pixels": int}]}
+_TRAINING = {"seconds": NUMBER, "notes": [str]}
+_EXPORT = {"failed_checks": [str], "notes": [str]}
+_JOINT = {"name": str, "type": str, "parent": str, "child": str, "residual": NUMBER, "ambiguous": bool}
+_SUMMARY = {
+    **{"parts": [str], "root": str, "states": int, "length_unit": str, "gaussians": int},
+    **{"joints": [_JOINT | {"axis_deviation": (NUMBER, None)}], "movable": int, "unattached": int},
+    **{"notes": [str], "thumbnails": [str]},
+}
 
 
 @dataclass(frozen=True)
@@ -83,8 +95,11 @@ class Fitting:
             case _:
                 return _train(work, stage, self._settings(work))
 
+    def outcome_shape(self, stage: str) -> Any:
+        return {"check": _CHECK, "export": _EXPORT, "summary": _SUMMARY}.get(stage.partition(" ")[0], _TRAINING)
+
     def row(self, entry: Entry, outcomes: dict[str, dict[str, Any]]) -> dict[str, Any]:
-        return outcomes["summary"] | {
+        return {key: outcomes["summary"][key] for key in _SUMMARY} | {
             "failed_checks": sum((outcomes[f"export {form}"]["failed_checks"] for form in self.exports), [])
         }
 

@@ -66,8 +66,9 @@ class Report:
         writer = csv.DictWriter(text, COLUMNS, restval="", extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(map(_flat, self.rows()))
-        out.write("report.csv", text.getvalue().encode())
-        with tempfile.NamedTemporaryFile("w", encoding="utf-8", suffix=".html") as page:
+        out.write("report.csv", text.getvalue().encode(errors="backslashreplace"))
+        named = {"encoding": "utf-8", "errors": "backslashreplace", "suffix": ".html"}  # paths need not be Unicode
+        with tempfile.NamedTemporaryFile("w", **named) as page:
             write_page(page, self.rows(), dict(self.counts), len(self._entries))
             page.flush()
             out.put(Path(page.name), "report.html")

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import tarfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.stage import Needs, Stage, Work, stage_key
 from splatart_ns.batch.storage import Storage, open_storage
+from splatart_ns.capture.synthesis_options import MOST_PIXELS
 from splatart_ns.errors import InputError
 
 if TYPE_CHECKING:
@@ -48,18 +49,15 @@ def find_bundles(source: str) -> list[str]:
     Raises:
         InputError: there is none.
     """
-    storage = open_storage(source)
-
-    def below(path: str) -> Iterator[str]:
+    storage, found, paths = open_storage(source), [], [""]
+    while paths:
+        path = paths.pop()
         folders, files = storage.children(path)
         if _ARTICULATION in files:
-            yield path
-            return
-        for name in sorted(folders):
-            if not name.startswith("."):
-                yield from below(f"{path}/{name}" if path else name)
-
-    found = list(below(""))
+            found.append(path)
+            continue
+        inner = (name for name in sorted(folders, reverse=True) if not name.startswith("."))
+        paths += [f"{path}/{name}" if path else name for name in inner]
     if not found:
         raise InputError(f"{source}: there is no bundle in it; give the --output-dir of `splatart batch`.")
     return found
@@ -72,6 +70,8 @@ class Shards(Sequence[Entry]):
         for name in ("images", "shard_size", "states"):
             if (value := getattr(options, name)) < 1:
                 raise InputError(f"--{name.replace('_', '-')} is {value}; give 1 or more.")
+        if not 8 <= options.resolution <= MOST_PIXELS:
+            raise InputError(f"--resolution is {options.resolution}; give 8 to {MOST_PIXELS}.")
         self._url, self._bundles, self._options = open_storage(source).url, bundles, options
 
     def __len__(self) -> int:
@@ -118,6 +118,9 @@ class Sharding:
         set_backend(self.rasterizer)
         pictures = self._write(work, work.folder / "images.tar")
         return {"images": work.entry.settings["count"], "thumbnails": pictures}, ["images.tar"]
+
+    def outcome_shape(self, stage: str) -> Any:
+        return {"digest": str} if stage == "read" else {"images": int, "thumbnails": [str]}
 
     def row(self, entry: Entry, outcomes: dict[str, dict[str, Any]]) -> dict[str, Any]:
         empty = {"parts": [], "joints": [], "failed_checks": []}

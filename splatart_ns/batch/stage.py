@@ -12,7 +12,7 @@ import time
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -22,6 +22,7 @@ from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.storage import FileInfo, Folder, Storage, open_storage, publish
 from splatart_ns.errors import InputError
 from splatart_ns.machine import process_lives
+from splatart_ns.shape import NUMBER, has_shape, parse
 
 _SCRATCH = "splatart-batch-"
 MARKERS = "stages"
@@ -92,6 +93,9 @@ class Recipe(Protocol):
             InputError: what the user can mend.
         """
 
+    def outcome_shape(self, stage: str) -> Any:
+        """Of what `run` returns of a stage, see `has_shape`."""
+
     def row(self, entry: Entry, outcomes: dict[str, dict[str, Any]]) -> dict[str, Any]:
         """What the report says of an object whose stages all ended well."""
 
@@ -148,6 +152,13 @@ def stage_key(*inputs: Any) -> str:
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
 
+_MARKER = {
+    **{"key": str, "seconds": NUMBER, "cpu_seconds": NUMBER, "outcome": dict, "files": dict},
+    **{"failed": str, "kind": str, "trace": str},
+}
+"""Shape of a marker's file."""
+
+
 def fingerprint(capture: str) -> str:
     """Hash of the names, sizes and stamps of a capture's files; they are not read.
 
@@ -160,13 +171,12 @@ def fingerprint(capture: str) -> str:
     return stage_key(sorted((name, info.size, info.stamp) for name, info in files.items()))
 
 
-def read_marker(out: Storage, name: str, stage: str) -> Marker | None:
-    """How a stage ended, if it did. A damaged marker counts as none."""
-    data = out.read(_marker_path(name, stage))
-    try:
-        return None if data is None else Marker(**json.loads(data))
-    except (ValueError, TypeError):
+def read_marker(out: Storage, name: str, stage: str, outcome: Any = dict) -> Marker | None:
+    """How a stage ended, if it did. One that is damaged, or whose outcome has not this shape, counts as none."""
+    told = asdict(Marker("", 0.0)) | (parse(out.read(_marker_path(name, stage)), {"key": str}) or {})
+    if told.keys() != _MARKER.keys() or not has_shape(told, _MARKER) or not told["key"]:
         return None
+    return Marker(**told) if told["failed"] or has_shape(told["outcome"], outcome) else None
 
 
 def write_marker(out: Storage, name: str, stage: str, marker: Marker) -> None:
@@ -176,7 +186,7 @@ def write_marker(out: Storage, name: str, stage: str, marker: Marker) -> None:
 
 
 def _marker_path(name: str, stage: str) -> str:
-    return f"{name}/{MARKERS}/{quote(stage, safe=' ')}.json"
+    return f"{name}/{MARKERS}/{quote(stage, safe=' ', errors='surrogateescape')}.json"
 
 
 def perform(recipe: Recipe, entry: Entry, stage: Stage, out_url: str) -> Marker:
@@ -186,7 +196,7 @@ def perform(recipe: Recipe, entry: Entry, stage: Stage, out_url: str) -> Marker:
     """
     clock, out = _Clock(), open_storage(out_url)
     try:
-        earlier = read_marker(out, entry.name, stage.name)
+        earlier = read_marker(out, entry.name, stage.name, recipe.outcome_shape(stage.name))
         if earlier is not None and earlier.is_whole(stage.key, out.files(entry.name)):
             return earlier
         with _scratch() as scratch:

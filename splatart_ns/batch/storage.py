@@ -84,7 +84,7 @@ class Folder:
             for entry in entries:
                 if entry.is_dir(follow_symlinks=False):
                     folders.append(entry.path)
-                elif not (entry.name.startswith(".") and ".tmp" in entry.name) and entry.is_file():
+                elif not (entry.name.startswith(".") and ".tmp" in entry.name) and _is_file(entry):
                     try:
                         stat = entry.stat()
                     except FileNotFoundError:  # another batch has just removed it
@@ -100,11 +100,13 @@ class Folder:
             return [], []
         # Links to folders are not followed: they may lead round.
         folders = [entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
-        return folders, [entry.name for entry in entries if not entry.is_dir()]
+        return folders, [entry.name for entry in entries if _is_file(entry)]
 
     def read(self, path: str) -> bytes | None:
+        if not os.path.isfile(file := os.path.join(self.url, path)):  # a pipe would never end
+            return None
         try:
-            return Path(self.url, path).read_bytes()
+            return Path(file).read_bytes()
         except (FileNotFoundError, NotADirectoryError):
             return None
 
@@ -211,6 +213,11 @@ class ObjectStore:
 
     def put(self, file: Path, path: str) -> None:
         self._fs.put_file(str(file), self._at(path))
+
+
+def _is_file(entry: os.DirEntry) -> bool:
+    """Whether it is a file or leads to one; links that lead nowhere, or round, are none."""
+    return os.path.isfile(entry.path) if entry.is_symlink() else entry.is_file()
 
 
 def _stamp(info: dict[str, Any]) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
 from splatart_ns.errors import InputError
-from splatart_ns.records import read_record
+from splatart_ns.records import LONGEST, read_record
 
 Configuration = dict[str, float | list[float]]
 """Joint name to value, radian or length, or to as many as the joint has freedoms (`Joint.values`); joints that are not
@@ -63,7 +63,7 @@ def _parse_number(number: str, joint: Joint, is_length: bool, where: str) -> flo
         value = float(number[:-3] if degrees else number)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
+    if not abs(value) < LONGEST:
         raise InputError(f"{where}: '{number}' for joint '{joint.name}' is no number; write 0.5 or 30deg")
     return math.radians(value) if degrees else value
 
@@ -110,6 +110,8 @@ def _sweep_values(joint: Joint, start: float | list[float], frames: int) -> list
 def read_trajectory(path: Path, bundle: Bundle) -> list[Configuration]:
     """Configurations from a CSV file: a header of joint names, then a row of values (see `parse_value`) per frame."""
     try:
+        if Path(path).exists() and not Path(path).is_file():  # a pipe would never end
+            raise InputError(f"{path}: is not a file; give a CSV file")
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
             rows = [(i, row) for i, row in enumerate(csv.reader(file), start=1) if any(cell.strip() for cell in row)]
     except OSError as error:

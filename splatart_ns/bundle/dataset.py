@@ -13,13 +13,14 @@ import torch
 from splatart_ns.bundle.articulated_splat import ArticulatedSplat, Picture
 from splatart_ns.bundle.camera import Camera, bounding_sphere, orbit_camera
 from splatart_ns.bundle.configurations import Configuration
+from splatart_ns.capture.synthesis_options import MOST_PIXELS
 from splatart_ns.errors import InputError
 
 _PLASTIC = 1.32471795724474602596
 """The root of x^3 = x + 1: multiples of 1/x and 1/x^2 cover a square evenly, however many there are (M. Roberts, The
 Unreasonable Effectiveness of Quasirandom Sequences, 2018)."""
-_SIZED_BY = 256
-"""So many configurations say how large the object is."""
+_MOST_STATES, _SIZED_BY = 100_000, 256
+"""Configurations that there may be; so many of them say how large the object is."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +63,10 @@ class Dataset:
     def __init__(self, splat: ArticulatedSplat, options: DatasetOptions | None = None):
         """Raises InputError for options that make no sense."""
         self.splat, self.options = splat, options or DatasetOptions()
-        for name, least in (("states", 1), ("resolution", 8), ("seed", 0)):
-            if (value := getattr(self.options, name)) < least:
-                raise InputError(f"--{name} is {value}; give {least} or more")
+        for name, least, most in (("states", 1, _MOST_STATES), ("resolution", 8, MOST_PIXELS), ("seed", 0, 2**128)):
+            if not least <= (value := getattr(self.options, name)) <= most:
+                rule = f"{least} or more" if value < least else f"{most} or less"
+                raise InputError(f"--{name} is {value}; give {rule}")
         some = [self.configuration(state) for state in range(min(self.options.states, _SIZED_BY))]
         self.centre, self.radius = bounding_sphere(splat.bundle, some)
         """Of a sphere about the object in all states, which every image shows whole."""

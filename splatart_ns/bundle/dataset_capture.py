@@ -26,7 +26,7 @@ SETTINGS = "dataset.json"
 _FORMAT = "splatart-dataset-1"
 _TRUTH = ("revolute", "prismatic", "fixed")
 """The joints that ground_truth.json can tell."""
-_POINTS = 10_000
+_MOST, _POINTS = 10_000_000, 10_000
 _MIN_OPACITY = 0.5
 
 
@@ -47,6 +47,8 @@ def write_dataset(
         InputError: a count below the number of states, or a folder that holds something else.
     """
     states = dataset.options.states
+    if count > _MOST:
+        raise InputError(f"--dataset is {count}; give at most {_MOST} images")
     if count < states:
         raise InputError(f"--dataset is {count}; give at least an image for each of the {states} --states")
     _claim(dataset, folder)

@@ -19,6 +19,8 @@ from splatart_ns.splats.splat import Splat
 
 FORMAT = "splatart-articulation-1"
 ARTICULATION = "articulation.json"
+_VARIANCE = 1e300
+"""Below which variances are: of what is hardly determined they are large."""
 
 
 def save_bundle(bundle: Bundle, folder: Path) -> None:
@@ -147,7 +149,7 @@ def _read_part(record: Record, num_states: int, folder: Path) -> Part:
         record.fail("motion_covariance", f"has {len(rows)} entries", f"give one for each of the {num_states} states")
     for state, row in enumerate(rows):
         if row is not None:
-            covariance[state] = record.numbers("motion_covariance", row, (6, 6))
+            covariance[state] = record.numbers("motion_covariance", row, (6, 6), _VARIANCE)
 
     splat = _read_splat(record, folder)
     if (count := record.integer("num_gaussians")) != len(splat):
@@ -216,7 +218,7 @@ def _read_covariance(record: Record, num_values: int) -> dict[str, Any]:
         if name not in shapes:
             record.fail(name, "is unknown", f"known are {', '.join(shapes)}")
         if block is not None:
-            record.numbers(name, block, shapes[name])
+            record.numbers(name, block, shapes[name], _VARIANCE)
     return record.fields
 
 

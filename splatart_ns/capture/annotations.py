@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from splatart_ns.capture.capture import UNLABELLED, CaptureError
 from splatart_ns.capture.images import MAX_LABEL, image_size, read_labels
 from splatart_ns.capture.rasters import decode_runs, decompress_runs, fill_polygon
-from splatart_ns.capture.values import is_inside, parse_number, read_json, read_text, show
+from splatart_ns.capture.values import is_inside, parse_number, read_json, read_text, read_yaml, show
 
 BACKGROUND_NAMES = ("background", "bg")
 UNLABELLED_NAMES = ("unlabelled", "unlabeled", "ignore", "void")
@@ -207,10 +206,7 @@ def _read_yolo(path: Path, files: Sequence[Path], texts: Sequence[Path]) -> Anno
 def _yolo_classes(path: Path, files: Sequence[Path]) -> list[str]:
     found = []
     for file in (f for f in files if f.name in ("data.yaml", "data.yml", "dataset.yaml")):
-        try:
-            content = yaml.safe_load(read_text(file))
-        except (yaml.YAMLError, RecursionError, ValueError):
-            raise CaptureError(file, "the file is not YAML", "export the labels again") from None
+        content = read_yaml(file)
         names = content.get("names") if isinstance(content, dict) else None
         if isinstance(names, dict) and list(names) == list(range(len(names))):
             names = list(names.values())

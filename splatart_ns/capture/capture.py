@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from splatart_ns.errors import InputError
+from splatart_ns.errors import InputError, printable
 
 Worlds = Literal["shared", "rigid", "similar"]
 """How the states' worlds differ: not at all, by a rigid motion (a device measured lengths), or by one with a scale."""
@@ -31,7 +31,7 @@ class Problem:
     """What to do about it."""
 
     def __str__(self) -> str:
-        return f"{self.file}: {self.message}; {self.mend}"
+        return printable(f"{self.file}: {self.message}; {self.mend}")
 
 
 class CaptureError(InputError):

@@ -201,7 +201,7 @@ def read_bytes(path: Path, size: int = _MOST_BYTES + 1) -> bytes:
     except OSError as error:
         raise CaptureError(path, f"the file cannot be read ({error.strerror})", "make it readable") from None
     if len(data) > _MOST_BYTES:
-        raise CaptureError(path, "the file is larger than 1 GiB", "save it as a PNG or JPEG")
+        raise CaptureError(path, "the file is larger than 1 GiB", "give a smaller one")
     return data
 
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import io
 import logging
 import re
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from PIL import Image
 
+from splatart_ns.capture.images import read_bytes
 from splatart_ns.capture.surface import Surface, join
+from splatart_ns.capture.values import LONGEST, is_inside
 from splatart_ns.errors import InputError
 
 _log = logging.getLogger(__name__)
@@ -23,17 +26,20 @@ _SUFFIXES = {".obj", ".dae", ".stl", ".glb", ".gltf", ".ply", ".off"}
 
 
 class _Beside(trimesh.resolvers.FilePathResolver):
-    """Finds what a mesh file names (materials, textures) relative to that file, outside its folder too.
+    """Finds what a mesh file names (materials, textures) relative to that file, up to two folders above its own.
 
     trimesh 5 refuses paths such as ../images/wood.jpg, and then drops the texture without a word.
     """
 
     def get(self, name: str) -> bytes:
         path = Path(self.parent) / name.strip().replace("\\", "/").removeprefix("file://")
+        if not is_inside(Path(self.parent).resolve().parent.parent, path):
+            _log.warning("%s lies far from the mesh that names it; its material is left out", path)
+            raise FileNotFoundError(path)
         if not path.is_file():
             _log.warning("%s is not there, though a mesh beside it names it; its material is left out", path)
             raise FileNotFoundError(path)
-        return path.read_bytes()
+        return read_bytes(path)
 
 
 def load_mesh(path: Path, colour: tuple[float, float, float] | None = None) -> Surface:
@@ -50,9 +56,12 @@ def load_mesh(path: Path, colour: tuple[float, float, float] | None = None) -> S
         raise InputError(f"{path}: the mesh is not there; put it there or mend its name in the URDF.")
     if path.suffix.lower() not in _SUFFIXES:
         raise InputError(f"{path}: meshes of type {path.suffix!r} are not read; convert it to OBJ, DAE, STL or GLB.")
+    data = read_bytes(path)
+    if zipfile.is_zipfile(io.BytesIO(data)):  # which a few bytes can fill any memory with
+        raise InputError(f"{path}: the mesh is a ZIP archive; unpack it.")
     try:
         scene = trimesh.load_scene(
-            io.BytesIO(path.read_bytes()),
+            io.BytesIO(data),
             file_type=path.suffix[1:].lower(),
             resolver=_Beside(str(path)),
             process=False,
@@ -71,7 +80,11 @@ def load_mesh(path: Path, colour: tuple[float, float, float] | None = None) -> S
     if not surfaces:
         raise InputError(f"{path}: the mesh holds no triangles; export it again.")
     surface = join(surfaces)
-    return surface.moved(np.diag([_unit(path)] * 3 + [1.0])) if path.suffix.lower() == ".dae" else surface
+    if path.suffix.lower() == ".dae":
+        surface = surface.moved(np.diag([_unit(path, data)] * 3 + [1.0]))
+    if not np.abs(surface.corners).max() < LONGEST:
+        raise InputError(f"{path}: the mesh has corners that are not finite or far away; export it again.")
+    return surface
 
 
 def box(size: np.ndarray, colour: tuple[float, float, float] | None = None) -> Surface:
@@ -139,7 +152,13 @@ def _opaque(image: Image.Image) -> Image.Image:
     return image.convert("RGB")
 
 
-def _unit(path: Path) -> float:
+def _unit(path: Path, data: bytes) -> float:
     """Metres per unit of a COLLADA file, which readers of URDF (rviz, Gazebo) apply."""
-    found = re.search(rb'<unit\b[^>]*\bmeter\s*=\s*["\']([0-9.eE+-]+)["\']', path.read_bytes()[:100_000])
-    return float(found.group(1)) if found else 1.0
+    found = re.search(rb'<unit\b[^>]*\bmeter\s*=\s*["\']([^"\']*)["\']', data[:100_000])
+    try:
+        unit = float(found.group(1)) if found else 1.0
+    except ValueError:
+        unit = 0.0
+    if not 1e-9 < unit < 1e9:
+        raise InputError(f"{path}: its unit is {found.group(1)!r} metres; give a length above 0.")
+    return unit

@@ -8,10 +8,9 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import yaml
-
 from splatart_ns.capture.capture import CaptureError, Frame, Report, State
 from splatart_ns.capture.values import (
+    check_inside,
     inner_path,
     parse_camera,
     parse_matrix,
@@ -19,6 +18,7 @@ from splatart_ns.capture.values import (
     parse_pose,
     read_inner_json,
     read_text,
+    read_yaml,
     relative_path,
     show,
 )
@@ -84,14 +84,12 @@ def _read_dta(path: Path, report: Report) -> list[State]:
     `cam_K.txt`; `color_segmented/ID.png`, `mask/ID.png` and, in thousandths, `depth_filtered/ID.png`. Every 8th frame
     of a state is for tests."""
     file = path / "init_keyframes.yml"
-    try:
-        keyframes = yaml.safe_load(read_text(file))
-    except (yaml.YAMLError, RecursionError, ValueError):
-        keyframes = None
+    keyframes = read_yaml(check_inside(path, file))
     if not isinstance(keyframes, dict):
         raise CaptureError(file, "the file holds no keyframes", "write frame_ID: {cam_in_ob: [...], time: 0}")
+    text = read_text(check_inside(path, path / "cam_K.txt"))
     try:
-        rows = [[float(x) for x in line.split()] for line in read_text(path / "cam_K.txt").splitlines() if line.strip()]
+        rows = [[float(x) for x in line.split()] for line in text.splitlines() if line.strip()]
     except ValueError:
         rows = []
     K = parse_matrix(path / "cam_K.txt", "the intrinsic matrix", rows, ((3, 3),))

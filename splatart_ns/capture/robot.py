@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from splatart_ns.capture import meshes
 from splatart_ns.capture.surface import Surface, join, merge_coincident
+from splatart_ns.capture.values import LONGEST, show
 from splatart_ns.errors import InputError
 
 MOVABLE = ("revolute", "continuous", "prismatic")
+_MOST_BYTES, _MOST_LINKS = 64 << 20, 10_000
 
 
 @dataclass(frozen=True)
@@ -96,12 +99,14 @@ class Robot:
         for joint in self.movable:
             low, high = joint.limits or (-math.inf, math.inf)
             out[joint.name] = float(values.get(joint.name, min(max(0.0, low), high)))
-        # A mimic may follow a mimic: settle as many times as there are joints.
-        for _ in self.movable:
-            for joint in self.movable:
-                if joint.mimic is not None:
-                    m = joint.mimic
-                    out[joint.name] = m.multiplier * out[m.joint] + m.offset
+        # A mimic may follow a mimic, but none itself.
+        mimics = [joint for joint in self.movable if joint.mimic is not None]
+        for _ in mimics:
+            before = dict(out)
+            for joint in mimics:
+                out[joint.name] = joint.mimic.multiplier * out[joint.mimic.joint] + joint.mimic.offset
+            if out == before:
+                break
         return out
 
     def link_poses(self, values: Mapping[str, float]) -> dict[str, np.ndarray]:
@@ -156,9 +161,11 @@ def read_urdf(path: Path) -> Robot:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give the path of a URDF.")
+    if path.stat().st_size > _MOST_BYTES:
+        raise InputError(f"{path}: the file is larger than {_MOST_BYTES >> 20} MiB; give a URDF of fewer links.")
     try:
         robot = ElementTree.fromstring(path.read_bytes())
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the latter of an encoding that is none
         raise InputError(f"{path}: not well-formed XML ({error}); give a URDF.") from error
     if robot.tag != "robot":
         raise InputError(f"{path}: the outermost element is <{robot.tag}>, not <robot>; give a URDF.")
@@ -177,7 +184,10 @@ def read_urdf(path: Path) -> Robot:
             if material is not None and material.find("color") is None and material.get("name") in colours:
                 material.append(colours[material.get("name")].find("color"))
         links[name] = visuals
-    joints = tuple(_joint(e, path) for e in robot.findall("joint"))
+    elements = robot.findall("joint")
+    if max(len(links), len(elements)) > _MOST_LINKS:
+        raise InputError(f"{path}: has {len(links)} links and {len(elements)} joints; give at most {_MOST_LINKS}.")
+    joints = tuple(_joint(element, path) for element in elements)
     return Robot(path, robot.get("name", path.stem), links, joints, _root(links, joints, path))
 
 
@@ -223,19 +233,21 @@ def _joint(element: ElementTree.Element, path: Path) -> Joint:
 
 def _root(links: Mapping[str, object], joints: tuple[Joint, ...], path: Path) -> str:
     """The link that is nobody's child, once links and joints are known to make one tree."""
-    names = [j.name for j in joints]
-    for name in names:
-        if names.count(name) > 1:
+    for name, count in Counter(j.name for j in joints).items():
+        if count > 1:
             raise InputError(f"{path}: two joints are called {name!r}; rename one.")
+    movable = {j.name for j in joints if j.type in MOVABLE}
     for joint in joints:
         for link in (joint.parent, joint.child):
             if link not in links:
                 raise InputError(f"{path}: joint {joint.name!r} names the link {link!r}, which is not there; add it.")
-        if joint.mimic is not None and joint.mimic.joint not in {j.name for j in joints if j.type in MOVABLE}:
-            raise InputError(f"{path}: joint {joint.name!r} mimics {joint.mimic.joint!r}, which is no movable joint.")
-    parents = [j.child for j in joints]
-    for link in parents:
-        if parents.count(link) > 1:
+        if joint.mimic is not None and joint.mimic.joint not in movable:
+            found = f"joint {joint.name!r} mimics {joint.mimic.joint!r}, which is no movable joint"
+            raise InputError(f"{path}: {found}; name one that is.")
+    _check_mimics(joints, path)
+    parents = Counter(j.child for j in joints)
+    for link, count in parents.items():
+        if count > 1:
             raise InputError(f"{path}: link {link!r} is the child of two joints; a URDF is a tree, remove one.")
     roots = [link for link in links if link not in parents]
     if len(roots) != 1:
@@ -251,6 +263,20 @@ def _root(links: Mapping[str, object], joints: tuple[Joint, ...], path: Path) ->
     if lost:
         raise InputError(f"{path}: the links {', '.join(lost)} hang in a loop; a URDF is a tree, remove a joint.")
     return roots[0]
+
+
+def _check_mimics(joints: tuple[Joint, ...], path: Path) -> None:
+    """No joint mimics itself, by way of others or not."""
+    followed = {j.name: j.mimic.joint for j in joints if j.mimic is not None}
+    settled: set[str] = set()
+    for name in followed:
+        chain: set[str] = set()
+        while name in followed and name not in settled:
+            if name in chain:
+                raise InputError(f"{path}: joint {name!r} mimics itself; remove a <mimic>.")
+            chain.add(name)
+            name = followed[name]
+        settled |= chain
 
 
 def _children(joints: tuple[Joint, ...]) -> dict[str, list[Joint]]:
@@ -273,11 +299,11 @@ def _visual(visual: ElementTree.Element, path: Path) -> Surface:
         mesh = find_mesh(_attribute(shape, "filename", path), path)
         return meshes.load_mesh(mesh, colour).moved(np.diag([*scale, 1.0]))
     if shape.tag == "box":
-        return meshes.box(_numbers(shape, "size", 3, path), colour)
+        return meshes.box(_sizes(shape, "size", 3, path), colour)
     if shape.tag == "cylinder":
-        return meshes.cylinder(_numbers(shape, "radius", 1, path)[0], _numbers(shape, "length", 1, path)[0], colour)
+        return meshes.cylinder(_sizes(shape, "radius", 1, path)[0], _sizes(shape, "length", 1, path)[0], colour)
     if shape.tag == "sphere":
-        return meshes.sphere(_numbers(shape, "radius", 1, path)[0], colour)
+        return meshes.sphere(_sizes(shape, "radius", 1, path)[0], colour)
     raise InputError(f"{path}: the shape <{shape.tag}> is not known; use mesh, box, cylinder or sphere.")
 
 
@@ -313,12 +339,19 @@ def _attribute(element: ElementTree.Element, key: str, path: Path) -> str:
     return value
 
 
+def _sizes(element: ElementTree.Element, key: str, count: int, path: Path) -> np.ndarray:
+    sizes = _numbers(element, key, count, path)
+    if not (sizes > 0).all():
+        raise InputError(f"{path}: <{element.tag} {key}={element.get(key)!r}> should be above 0; mend it.")
+    return sizes
+
+
 def _numbers(element: ElementTree.Element, key: str, count: int, path: Path, default: str | None = None) -> np.ndarray:
     text = element.get(key, default)
     try:
         numbers = np.array([float(x) for x in text.split()]) if text is not None else np.empty(0)
     except ValueError:
         numbers = np.empty(0)
-    if len(numbers) != count or not np.isfinite(numbers).all():
-        raise InputError(f"{path}: <{element.tag} {key}={text!r}> should hold {count} finite numbers; mend it.")
+    if len(numbers) != count or not (np.abs(numbers) < LONGEST).all():
+        raise InputError(f"{path}: <{element.tag} {key}={show(text)}> should hold {count} finite numbers; mend it.")
     return numbers

@@ -47,6 +47,8 @@ def segment(capture: Capture, prompts: Path, output: Path, segmenter: Segmenter)
     names = list(capture.parts.values())
     names += [name for parts in wanted.values() for name in parts if name not in names]
     names = list(dict.fromkeys(names))
+    if same := {name.lower() for name in names if [other.lower() for other in names].count(name.lower()) > 1}:
+        raise CaptureError(prompts, f"two parts are called {show(min(same))}", "spell it alike everywhere")
     if len(names) > MAX_LABEL:
         raise CaptureError(prompts, f"there are {len(names)} parts", f"name at most {MAX_LABEL}")
     with new_folder(output) as folder:
@@ -73,7 +75,7 @@ def _read_prompts(file: Path, frames: dict[str, tuple[State, Frame]]) -> dict[st
         camera = frames[key][1].camera
         wanted[key] = {}
         for name, value in parts.items():
-            if not name.strip() or "," in name or "\n" in name:
+            if not name.strip() or "," in name or not name.isprintable():
                 raise CaptureError(file, f"a part of {key} is called {show(name)}", "give it a name without commas")
             wanted[key][name] = _parse_prompt(file, f"{name} of {key}", value, camera.width, camera.height)
     if not wanted:

@@ -16,7 +16,7 @@ from splatart_ns.capture.images import write_png
 from splatart_ns.capture.ray_caster import RayCaster
 from splatart_ns.capture.robot import Joint, Robot, read_urdf
 from splatart_ns.capture.scene import Scene, camera_poses, ground_truth
-from splatart_ns.capture.synthesis_options import SynthesisOptions
+from splatart_ns.capture.synthesis_options import MOST_PIXELS, SynthesisOptions
 from splatart_ns.errors import InputError
 from splatart_ns.files import new_folder
 
@@ -64,9 +64,12 @@ def _check(options: SynthesisOptions) -> None:
     def refuse(name: str, rule: str) -> None:
         raise InputError(f"The option {name.replace('_', '-')} is {getattr(options, name)}; give {rule}.")
 
-    for name, least in (("states", 2), ("train_views", 1), ("test_views", 0), ("resolution", 8), ("samples", 1)):
+    ranges = {"states": (2, 1000), "train_views": (1, 100_000), "test_views": (0, 100_000), "samples": (1, 64)}
+    for name, (least, most) in (ranges | {"resolution": (8, MOST_PIXELS)}).items():
         if getattr(options, name) < least:
             refuse(name, f"{least} or more")
+        if getattr(options, name) > most:
+            refuse(name, f"{most} or less")
     if not 1.0 <= options.fov_degrees <= 120.0:
         refuse("fov_degrees", "1 to 120")
     if not 0.0 <= options.labelled_fraction <= 1.0:
@@ -77,7 +80,7 @@ def _check(options: SynthesisOptions) -> None:
         refuse("seed", "0 or more")
     if len(options.joint_values) == 1:
         refuse("joint_values", "the values of two states or more")
-    if not np.linalg.norm(options.light.direction) > 0.0 or not 0.0 <= options.light.ambient <= 1.0:
+    if not 0.0 < np.linalg.norm(options.light.direction) < math.inf or not 0.0 <= options.light.ambient <= 1.0:
         refuse("light", "a direction that is not zero and an ambient share of 0 to 1")
 
 
@@ -110,8 +113,9 @@ def _frozen(robot: Robot, options: SynthesisOptions) -> dict[str, float]:
     for text in options.freeze:
         frozen.update(_assignments(text, robot))
     values = robot.complete(frozen)
-    for _ in robot.movable:
-        frozen.update({j.name: values[j.name] for j in robot.movable if j.mimic and j.mimic.joint in frozen})
+    followers = [j for j in robot.movable if j.mimic is not None]
+    while new := {j.name: values[j.name] for j in followers if j.mimic.joint in frozen and j.name not in frozen}:
+        frozen.update(new)
     return frozen
 
 

@@ -7,6 +7,8 @@ from typing import Literal
 
 from splatart_ns.capture.light import Light
 
+MOST_PIXELS = 16384
+"""Along a side of an image that is made."""
 OBJECTS = ("hinge", "drawer", "arm")
 """The names of the built-in objects."""
 

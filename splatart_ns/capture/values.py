@@ -18,11 +18,12 @@ import numpy as np
 from splatart_ns.capture.capture import Camera, CaptureError
 from splatart_ns.capture.images import image_size, undistorted_camera
 from splatart_ns.errors import InputError
+from splatart_ns.plain_yaml import parse_yaml
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MOST_BYTES = 256 << 20
-_LONGEST = 1e12  # a coordinate or focal length beyond this is a mistake, and its square still is a float
+LONGEST = 1e12  # a coordinate or focal length beyond this is a mistake, and its square still is a float
 
 
 def read_text(file: Path) -> str:
@@ -60,11 +61,23 @@ def read_json(file: Path) -> dict[str, Any]:
     return value
 
 
-def read_inner_json(file: Path, root: Path) -> dict[str, Any]:
-    """A JSON object of a file that lies in `root`, all links followed."""
+def read_yaml(file: Path) -> Any:
+    try:
+        return parse_yaml(read_text(file))
+    except ValueError as error:
+        raise CaptureError(file, f"the file is not YAML ({error})", "write it again, or restore a copy") from None
+
+
+def check_inside(root: Path, file: Path) -> Path:
+    """The file, which lies in `root`, all links followed."""
     if not is_inside(root, file):
         raise CaptureError(file, "it is a link out of the capture", "copy what it leads to into the capture")
-    return read_json(file)
+    return file
+
+
+def read_inner_json(file: Path, root: Path) -> dict[str, Any]:
+    """A JSON object of a file that lies in `root`, all links followed."""
+    return read_json(check_inside(root, file))
 
 
 def relative_path(file: Path, what: str, value: Any) -> str:
@@ -84,7 +97,7 @@ def inner_path(file: Path, root: Path, what: str, value: Any) -> Path:
 
 
 def parse_number(file: Path, what: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not -_LONGEST < value < _LONGEST:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not -LONGEST < value < LONGEST:
         raise CaptureError(file, f"{what} is {show(value)}", "write a number")
     return float(value)
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from rich.console import Console
 
-CONSOLE = Console()
+CONSOLE = Console(markup=False)  # paths and names may have brackets
 Quality = Literal["draft", "standard", "high"]
 Rasterizer = Literal["auto", "torch", "numba", "gsplat"]
 

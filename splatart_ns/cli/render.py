@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.progress import track
 
+from splatart_ns.capture.synthesis_options import MOST_PIXELS
 from splatart_ns.cli.common import CONSOLE, Rasterizer, choose_rasterizer
 from splatart_ns.errors import InputError
 
@@ -81,7 +82,10 @@ class Render:
         wrong = {
             "frames": ("1 or more", self.frames < 1),
             "fps": ("a number above 0, at most 1000", not 0 < self.fps <= 1000),
-            "resolution": ("1 or more", self.resolution < 1),
+            "resolution": (
+                "1 or more" if self.resolution < 1 else f"{MOST_PIXELS} or less",
+                not 1 <= self.resolution <= MOST_PIXELS,
+            ),
             "azimuth": ("a finite angle", self.azimuth is not None and not math.isfinite(self.azimuth)),
             "elevation": ("-90 to 90", not -90 <= self.elevation <= 90),
             "background": ("three numbers from 0 to 1", not all(0 <= c <= 1 for c in self.background)),

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.capture import Normalization
+from splatart_ns.capture.values import check_inside
 from splatart_ns.capture.view import load_points
 from splatart_ns.records import Record, read_record
 
@@ -76,7 +77,7 @@ def load_ground_truth(capture: Path) -> GroundTruth | None:
     path = Path(capture) / "ground_truth.json"
     if not path.is_file():
         return None
-    top = read_record(path, "check the capture's folder")
+    top = read_record(check_inside(capture, path), "check the capture's folder")
     if (form := top.text("format")) != FORMAT:
         top.fail("format", f"is '{form}'", f"this version reads '{FORMAT}'")
     shaped = [record for record in top.records("parts") if record.flag("has_geometry")]
@@ -85,7 +86,11 @@ def load_ground_truth(capture: Path) -> GroundTruth | None:
         top.fail("parts", "has none with geometry", "give the truth about something that can be seen")
     root = next((record for record in shaped if record.flag("root")), shaped[0]).integer("id")
 
+    if top.record("cameras").number("object_bounding_radius") <= 0:
+        top.record("cameras").fail("object_bounding_radius", "is not above 0", "give the object's radius")
     states = top.records("states")
+    if not states:
+        top.fail("states", "is empty", "give the truth of each state")
     motions = {
         part: torch.cat(
             [s.record("motion_from_state_0").motions(n, [s.record("motion_from_state_0").items(n)], 1) for s in states]
@@ -95,7 +100,7 @@ def load_ground_truth(capture: Path) -> GroundTruth | None:
     joints = [_read_joint(record, len(states), parts) for record in top.records("joints")]
     points = {}
     for part in parts:
-        file = Path(capture) / "ground_truth_points" / f"part_{part}.ply"
+        file = check_inside(capture, Path(capture) / "ground_truth_points" / f"part_{part}.ply")
         points[part] = load_points(file, Normalization(torch.zeros(3).numpy(), 1.0))[0].double()
     return GroundTruth(
         parts=parts,

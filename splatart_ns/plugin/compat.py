@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import random
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -11,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.utils import writer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
 from splatart_ns.errors import InputError
+from splatart_ns.plain_yaml import parse_yaml
 
 
 def allow_checkpoint_scalars() -> None:
@@ -63,21 +65,6 @@ class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     """One pass over memory in place of a dozen."""
 
 
-class _TagBlindLoader(yaml.SafeLoader):
-    """Reads nerfstudio's config.yml as plain data; Python tags build nothing."""
-
-
-def _plain(loader: yaml.SafeLoader, _suffix: str, node: yaml.Node) -> Any:
-    if isinstance(node, yaml.MappingNode):
-        return loader.construct_mapping(node, deep=True)
-    if isinstance(node, yaml.SequenceNode):
-        return loader.construct_sequence(node, deep=True)
-    return loader.construct_scalar(node)
-
-
-_TagBlindLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
-
-
 def read_run_config(config: Path) -> dict[str, Any]:
     """The fields of a run's config.yml, nested dicts and lists of plain values. Nothing is executed.
 
@@ -85,42 +72,82 @@ def read_run_config(config: Path) -> dict[str, Any]:
         InputError: when the file cannot be read.
     """
     try:
-        fields = yaml.load(config.read_text(), Loader=_TagBlindLoader)  # a SafeLoader: builds plain values only
-    except (OSError, yaml.YAMLError) as error:
+        fields = parse_yaml(config.read_text(encoding="utf-8"), ignore_tags=True) if config.is_file() else None
+    except (OSError, ValueError) as error:
         raise InputError(f"{config} cannot be read as a nerfstudio config ({error}); train that stage again.") from None
     if not isinstance(fields, dict):
         raise InputError(f"{config} does not hold a nerfstudio config; train that stage again.")
     return fields
 
 
-def read_checkpoint(config: Path) -> dict[str, torch.Tensor]:
-    """The pipeline state of the newest checkpoint beside a run's config.yml.
+def run_setting(config: Path, *names: str) -> Any:
+    """What a run's config.yml has under these names, each below the one before.
 
     Raises:
-        InputError: when there is none or it cannot be read.
+        InputError: when the file cannot be read or has no such field.
+    """
+    value: Any = read_run_config(config)
+    for name in names:
+        if not isinstance(value, dict) or name not in value:
+            raise InputError(f"{config} has no {'.'.join(names)}; train that stage again.")
+        value = value[name]
+    return value
+
+
+def read_checkpoint(
+    config: Path, shapes: Mapping[str, Sequence[int | str]], other: str | None = None
+) -> dict[str, torch.Tensor]:
+    """The pipeline state of the newest checkpoint beside a run's config.yml.
+
+    `shapes` are those of the tensors that it must have: sizes, or words that stand for the same size everywhere.
+    `other` is what to say of one that has them not.
+
+    Raises:
+        InputError: when there is none, it cannot be read, or has not these tensors.
     """
     folder = config.parent / "nerfstudio_models"
     files = sorted(folder.glob("step-*.ckpt"))
     if not files:
         raise InputError(f"{folder} holds no checkpoint (step-*.ckpt); train that stage again.")
+    if not files[-1].is_file():
+        raise InputError(f"{files[-1]} is not a file; train that stage again.")
     try:
-        return torch.load(files[-1], map_location="cpu", weights_only=True)["pipeline"]
+        state = torch.load(files[-1], map_location="cpu", weights_only=True)["pipeline"]
     except Exception as error:  # torch raises many types for a broken file
         raise InputError(f"{files[-1]} cannot be read ({type(error).__name__}); train that stage again.") from None
+    sizes: dict[str, int] = {}
+    for name, shape in shapes.items():
+        tensor = state.get(name) if isinstance(state, dict) else None
+        if not isinstance(tensor, torch.Tensor) or not _has_sizes(tensor, shape, sizes):
+            wanted = ", ".join(map(str, shape))
+            found = f"{files[-1]} has no '{name}' of the shape [{wanted}]"
+            raise InputError(other or f"{found}; train that stage again.")
+    return state
+
+
+def _has_sizes(tensor: torch.Tensor, shape: Sequence[int | str], sizes: dict[str, int]) -> bool:
+    """Whether a tensor has this shape; `sizes` are those of the words that are known, and gets the others."""
+    if tensor.ndim != len(shape) or tensor.layout is not torch.strided:
+        return False
+    pairs = zip(shape, tensor.shape, strict=True)
+    return all(size == (sizes.setdefault(s, size) if isinstance(s, str) else s) for s, size in pairs)
 
 
 def finished_runs(capture: Path, method: str) -> list[Path]:
     """The config.yml of every run of a method on a capture under outputs/ that left a checkpoint, oldest first."""
     configs = Path("outputs").glob(f"*/{method}/*/config.yml")
     finished = [c for c in configs if any((c.parent / "nerfstudio_models").glob("step-*.ckpt"))]
-    on_capture = [c for c in finished if _data_of(read_run_config(c)).resolve() == capture.resolve()]
+    on_capture = [c for c in finished if _data_of(c) == os.path.realpath(capture)]
     return sorted(on_capture, key=lambda config: config.stat().st_mtime)
 
 
-def _data_of(run: dict[str, Any]) -> Path:
+def _data_of(config: Path) -> str:
     """Where the data of a run are; paths are lists of their parts in config.yml."""
-    datamanager = run["pipeline"]["datamanager"]
-    return Path(*(datamanager["data"] or datamanager["dataparser"]["data"] or ()))
+    parts = run_setting(config, "pipeline", "datamanager", "data")
+    parts = parts or run_setting(config, "pipeline", "datamanager", "dataparser", "data") or []
+    if not isinstance(parts, list) or not all(isinstance(part, str) and "\0" not in part for part in parts):
+        raise InputError(f"{config} does not say where its capture is; train that stage again.")
+    return os.path.realpath(Path(*parts))
 
 
 class StartView(ViewerControl):

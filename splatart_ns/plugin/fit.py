@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import platform
 import shutil
 import time
@@ -24,6 +23,7 @@ from splatart_ns.bundle import load_bundle
 from splatart_ns.capture.capture import Capture, Worlds
 from splatart_ns.capture.check import require_valid
 from splatart_ns.capture.digest import capture_digest
+from splatart_ns.capture.values import is_inside
 from splatart_ns.errors import InputError
 from splatart_ns.files import write_json
 from splatart_ns.method_configs.joint import method as joint_method
@@ -33,6 +33,7 @@ from splatart_ns.plugin.companion import Companions, Outcome
 from splatart_ns.plugin.semantic import RefineCameras
 from splatart_ns.plugin.stage_run import num_processes, run_side_by_side, run_stage
 from splatart_ns.rasterize.rasterization import Backend, default_backend, set_backend
+from splatart_ns.shape import NUMBER, has_shape, parse
 from splatart_ns.stages.joint_constraint import parse_constraints
 
 Quality = Literal["draft", "standard", "high"]
@@ -61,6 +62,9 @@ EFFORTS: dict[Quality, Effort] = {
 }
 SMALLEST = 128
 """Along the shorter side of images that are made smaller."""
+
+
+_REPORT = {"stages": [{"name": str, "seconds": NUMBER}], "settings": dict}
 
 
 @dataclass(frozen=True)
@@ -109,30 +113,24 @@ class Report:
 
     def _read_stages(self) -> list[dict[str, Any]]:
         """What an earlier run has finished, when it was of the same capture and settings."""
-        try:
-            earlier = json.loads(self.path.read_text())
-            stages = [
-                {
-                    **entry,
-                    "name": str(entry["name"]),
-                    "wall_seconds": entry.get("wall_seconds", entry["seconds"]) + 0.0,  # versions before had no other
-                }
-                for entry in earlier["stages"]
-            ]
-            had, wanted = earlier["settings"], self.data["settings"]
-            same = all(earlier.get(key) == self.data[key] for key in ("capture", "capture_sha256"))
-            last = ("root", "joints") if wanted["worlds"] == "shared" else ("joints",)  # the last stage alone asks
-            same = same and {k: v for k, v in had.items() if k not in last} == {
-                k: v for k, v in wanted.items() if k not in last
-            }
-            if any(had.get(k) != wanted[k] for k in last):
-                stages = [stage for stage in stages if stage["name"] != "joint"]
-        except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        earlier = parse(self.path.read_bytes() if self.path.is_file() else None, _REPORT) or {"stages": None}
+        # Versions before had seconds alone.
+        stages = [{"wall_seconds": entry["seconds"], **entry} for entry in earlier["stages"] or ()]
+        if earlier["stages"] is None or not has_shape(stages, [{"wall_seconds": NUMBER}]):
             raise InputError(
                 f"{self.path} is not a report of `splatart fit`; remove it or choose another --output-dir."
-            ) from None
+            )
+        had, wanted = earlier["settings"], self.data["settings"]
+        same = all(earlier.get(key) == self.data[key] for key in ("capture", "capture_sha256"))
+        last = ("root", "joints") if wanted["worlds"] == "shared" else ("joints",)  # the last stage alone asks
+        same = same and {k: v for k, v in had.items() if k not in last} == {
+            k: v for k, v in wanted.items() if k not in last
+        }
+        if any(had.get(k) != wanted[k] for k in last):
+            stages = [stage for stage in stages if stage["name"] != "joint"]
         if not same:
-            CONSOLE.print(f"{self.path.parent} holds a fit of another capture or with other settings; starting over.")
+            found = f"{self.path.parent} holds a fit of another capture or with other settings; starting over."
+            CONSOLE.print(found, markup=False)
         return stages if same else []
 
     def resume(self, stage: str, whole: bool) -> bool:
@@ -179,6 +177,8 @@ def fit(
     set_backend(rasterizer)
     settings = Settings(quality, root, seed, rasterizer, list(joints), worlds, refine_cameras)
     capture = require_fittable(capture_path, settings)
+    if is_inside(output_dir, capture_path) or any(is_inside(capture_path / s.name, output_dir) for s in capture.states):
+        raise InputError(f"{output_dir} holds the capture's files; choose another --output-dir, beside it.")
     output_dir = output_dir.absolute()
     report = Report(output_dir / "report.json", capture, settings)
     try:
@@ -353,7 +353,7 @@ def _progress() -> Iterator[Progress]:
     try:
         with Progress(
             SpinnerColumn(),
-            TextColumn("{task.description:<24}"),
+            TextColumn("{task.description:<24}", markup=False),
             BarColumn(),
             TextColumn("{task.completed:.0f}/{task.total:.0f}"),
             TimeElapsedColumn(),

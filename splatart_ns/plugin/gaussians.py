@@ -24,8 +24,18 @@ def gauss_params_from_splat(splat: Splat) -> dict[str, nn.Parameter]:
     return {name: nn.Parameter(tensor.detach().clone().contiguous()) for name, tensor in tensors.items()}
 
 
+SPLAT_SHAPES: dict[str, tuple[int | str, ...]] = {
+    f"_model.gauss_params.{name}": ("Gaussians", *shape)
+    for name, shape in {
+        **{"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,), "semantics": ("parts",)},
+        **{"features_dc": (3,), "features_rest": ("coefficients", 3)},
+    }.items()
+}
+"""Of what a checkpoint's pipeline state has of a splat."""
+
+
 def splat_from_state(state: dict[str, Tensor], prefix: str = "_model.gauss_params.") -> Splat:
-    """The Gaussians in a checkpoint's pipeline state."""
+    """The Gaussians in a checkpoint's pipeline state, which has tensors of `SPLAT_SHAPES`."""
     p = {name: state[prefix + name] for name in ("means", "scales", "quats", "opacities", "semantics")}
     return Splat(
         means=p["means"],

@@ -25,7 +25,7 @@ from splatart_ns.capture.capture import Normalization
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import se3_exp, se3_log
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint
-from splatart_ns.plugin.gaussians import gauss_params_from_splat, splat_from_state
+from splatart_ns.plugin.gaussians import SPLAT_SHAPES, gauss_params_from_splat, splat_from_state
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
@@ -207,13 +207,14 @@ class JointPipeline(VanillaPipeline):
         capture = self.datamanager.capture
         normalization = capture.normalization
         run = config.pose_run or find_pose_run(capture.path)
-        state = read_checkpoint(run)
         shape = (len(capture.states), len(capture.parts))
-        if "_model.merged" not in state or state["_model.poses.base"].shape[:2] != shape or not state["_model.merged"]:
-            raise InputError(
-                f"{run} is no finished splatart-pose run on a capture of {shape[0]} states and {shape[1]} parts; "
-                f"run `ns-train splatart-pose --data {capture.path}` again."
-            )
+        other = (
+            f"{run} is no finished splatart-pose run on a capture of {shape[0]} states and {shape[1]} parts; "
+            f"run `ns-train splatart-pose --data {capture.path}` again."
+        )
+        state = read_checkpoint(run, SPLAT_SHAPES | _pose_shapes(*shape), other)
+        if not state["_model.merged"]:
+            raise InputError(other)
         splat = splat_from_state(state)
         ids = splat.part_ids
         world = splat_to_world(splat, normalization)
@@ -250,7 +251,7 @@ class JointPipeline(VanillaPipeline):
         self.tree = doubted(self.tree, state["_model.alike"])
         self.notes = [f"{capture.parts[part]}: {reason}" for part, reason in self.tree.unattached.items()]
         for note in self.notes:
-            CONSOLE.log(note)
+            CONSOLE.log(note, markup=False)
         if not all(bool(states.all()) for states in known.values()):
             places, part_motions, _ = place_unseen(self.tree, part_motions, known)
             motions = torch.stack([part_motions[p] for p in sorted(capture.parts)], dim=1)
@@ -325,6 +326,14 @@ def find_pose_run(capture: Path) -> Path:
     return runs[-1]
 
 
+def _pose_shapes(S: int, P: int) -> dict[str, tuple[int, ...]]:
+    """Of what a splatart-pose run found about S states and P parts."""
+    return {
+        **{"_model.merged": (), "_model.poses.base": (S, P, 4, 4), "_model.covariance": (S, P, 6, 6)},
+        **{"_model.held_ratio": (P, P), "_model.worlds": (S, 4, 4), "_model.alike": (P,)},
+    }
+
+
 @dataclass
 class JointTrainerConfig(TrainerConfig):
     """A run without training steps: joints are fitted, the checkpoint and the bundle are written."""
@@ -346,7 +355,7 @@ class JointTrainer(Trainer):
         folder = self.config.bundle_dir or self.base_dir / "bundle"
         save_bundle(self.pipeline.bundle, folder)
         self.save_checkpoint(self.step)
-        CONSOLE.print(f"Bundle: {folder}\nConfig: {self.base_dir / 'config.yml'}")
+        CONSOLE.print(f"Bundle: {folder}\nConfig: {self.base_dir / 'config.yml'}", markup=False)
         self._init_viewer_state()
         self.pipeline.eval()
         if not self.config.viewer.quit_on_train_completion:

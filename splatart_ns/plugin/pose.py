@@ -178,7 +178,7 @@ class PosePipeline(VanillaPipeline):
             told = world_record(capture.states[k].name, self.model.part_names[part], self.model.worlds[k], fit)
             self.findings["worlds"].append(told)
             self.notes.append(world_sentence(told, capture.states[0].name))
-            CONSOLE.log(self.notes[-1])
+            CONSOLE.log(self.notes[-1], markup=False)
 
     def _initial_poses(self, splats: list[Splat]) -> Tensor:
         """Poses [S, P, 4, 4] to begin from; keeps in mind the reference states, and what is known and what stays."""
@@ -213,7 +213,7 @@ class PosePipeline(VanillaPipeline):
             turn, *others = (f"{math.degrees(so3_log(T[:3, :3]).norm()):.0f}" for T in (motion.T, *motion.alike))
             part = f"part {self.model.part_names[p + 1]}, state {s}"
             self.notes.append(f"{part}: turned by {turn} degrees; by {' or '.join(others)} it looks nearly the same.")
-            CONSOLE.log(self.notes[-1])
+            CONSOLE.log(self.notes[-1], markup=False)
 
     def _note_unknown(self, known: Tensor) -> None:
         """Say which poses [S, P] of a part no image tells."""
@@ -221,14 +221,14 @@ class PosePipeline(VanillaPipeline):
             part = f"part {self.model.part_names[p + 1]}, state {s}"
             put = "it is put where another state shows it" if s == 0 else "it moves as what it hangs on"
             self.notes.append(f"{part}: the images show too little of it to find its pose; {put}.")
-            CONSOLE.log(self.notes[-1])
+            CONSOLE.log(self.notes[-1], markup=False)
 
     def _note_turned(self, covariance: Tensor) -> None:
         """Say of which parts covariances [S, P, 6, 6] leave the turn open."""
         for s, p in may_have_turned(covariance).nonzero().tolist():
             part = f"part {self.model.part_names[p + 1]}, state {s}"
             self.notes.append(f"{part}: the images do not tell how far it turned about its own axis.")
-            CONSOLE.log(self.notes[-1])
+            CONSOLE.log(self.notes[-1], markup=False)
 
     def _poses_from_file(self) -> Tensor:
         if self.config.init_file is None:

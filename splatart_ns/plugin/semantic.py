@@ -307,7 +307,7 @@ class SemanticPipeline(VanillaPipeline):
         kept = trusted(votes)
         for i in (labelled[v] for v in (~kept).nonzero()[:, 0].tolist()):
             self.notes.append(f"{frames[i].labels}: contradicts the other frames' labels and is not used.")
-            CONSOLE.log(self.notes[-1])
+            CONSOLE.log(self.notes[-1], markup=False)
         self._labelled = {labelled[v] for v in kept.nonzero()[:, 0].tolist()}
         self.model.trusted[sorted(self._labelled)] = True
         if self.model.config.vote_init and step == self.model.config.semantic_start:

@@ -10,11 +10,16 @@ from torch import Tensor
 from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.view import View, load_views
 from splatart_ns.errors import InputError
-from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_config
-from splatart_ns.plugin.gaussians import splat_from_state
+from splatart_ns.plugin.compat import finished_runs, read_checkpoint, run_setting
+from splatart_ns.plugin.gaussians import SPLAT_SHAPES, splat_from_state
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.exposure import at_gain
 from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
+
+_SHAPES = {
+    "_model.cameras_refined": (),
+    **{"_model.viewmats": ("views", 4, 4), "_model.gains": ("views", 3), "_model.trusted": ("views",)},
+}
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,7 @@ def read_state(
     Raises:
         InputError: the run is not of this capture, or learned no parts.
     """
-    checkpoint = read_checkpoint(run)
+    checkpoint = read_checkpoint(run, SPLAT_SHAPES | _SHAPES)
     splat = splat_from_state(checkpoint).to(device)
     if splat.part_logits.shape[1] != num_parts + 1:
         raise InputError(
@@ -58,7 +63,9 @@ def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
     """
     found: dict[int, Path] = {}
     for config in finished_runs(capture, "splatart-semantic"):
-        found[read_run_config(config)["pipeline"]["datamanager"]["dataparser"]["state"]] = config
+        state = run_setting(config, "pipeline", "datamanager", "dataparser", "state")
+        if isinstance(state, int):
+            found[state] = config
     for state in range(num_states):
         if state not in found:
             raise InputError(

@@ -66,6 +66,10 @@ class StubRecipe:
                 log.write(f"{work.entry.name} {stage}\n")
         return result
 
+    def outcome_shape(self, stage):
+        shapes = {"look": {"texts": {"one": str, "two": str}}, "join": {"root": (str, None)}}
+        return shapes.get(stage, dict)
+
     def row(self, entry, outcomes) -> dict[str, Any]:
         return {
             "parts": list(outcomes["look"]["texts"]),

@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from splatart_ns.evaluation.ground_truth import load_ground_truth
 @pytest.fixture
 def copied(capture, tmp_path):
     (tmp_path / "ground_truth.json").write_bytes((capture / "ground_truth.json").read_bytes())
-    (tmp_path / "ground_truth_points").symlink_to(capture / "ground_truth_points")
+    shutil.copytree(capture / "ground_truth_points", tmp_path / "ground_truth_points")
     return tmp_path
 
 
@@ -73,6 +74,6 @@ def test_parts_without_geometry_are_known_by_name_alone(copied):
 
 
 def test_missing_points_are_named(copied):
-    (copied / "ground_truth_points").unlink()
+    shutil.rmtree(copied / "ground_truth_points")
     with pytest.raises(InputError, match=r"part_1\.ply"):
         load_ground_truth(copied)

@@ -49,16 +49,16 @@ def test_the_newest_checkpoint_is_read(tmp_path: Path) -> None:
     # nerfstudio's schedulers leave NumPy scalars beside the tensors.
     state = {"pipeline": {"a": torch.ones(2)}, "schedulers": {"means": {"_last_lr": [np.float64(0.1)]}}}
     torch.save(state, config.parent / "nerfstudio_models" / "step-000000119.ckpt")
-    assert torch.equal(read_checkpoint(config)["a"], torch.ones(2))
+    assert torch.equal(read_checkpoint(config, {"a": (2,)})["a"], torch.ones(2))
 
 
 def test_a_missing_or_cut_off_checkpoint_is_told(tmp_path: Path) -> None:
     config = write_run(tmp_path / "run", tmp_path, finished=False)
     with pytest.raises(InputError, match="no checkpoint"):
-        read_checkpoint(config)
+        read_checkpoint(config, {})
     (config.parent / "nerfstudio_models" / "step-000000001.ckpt").write_bytes(b"PK\x03\x04cut off")
     with pytest.raises(InputError, match="cannot be read"):
-        read_checkpoint(config)
+        read_checkpoint(config, {})
 
 
 def test_finished_runs_are_found_by_their_data_and_in_the_order_of_time(

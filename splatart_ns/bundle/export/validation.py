@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 from rich import box
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.export.consumers import (
@@ -212,6 +212,6 @@ def format_checks(checks: list[Check]) -> Table:
         table.add_column(column, overflow="fold")
     colours = {"passed": "green", "failed": "red", "not checked": "yellow", "note": "default"}
     for check in checks:
-        verdict = f"[{colours[check.verdict]}]{check.verdict}[/]"
-        table.add_row(check.program, check.what, verdict, escape(check.found))
+        verdict = Text(check.verdict, colours[check.verdict])
+        table.add_row(Text(check.program), Text(check.what), verdict, Text(check.found))
     return table
