@@ -81,6 +81,8 @@ def test_the_report_tells_what_every_stage_took(hinge_fit):
     assert report["seconds"] == pytest.approx(sum(stage["wall_seconds"] for stage in report["stages"]), abs=0.01)
     assert report["settings"] == SETTINGS
     assert {"python", "torch", "nerfstudio", "splatart-ns"} <= set(report["versions"])
+    thinned = report["stages"][STAGES.index("pose")]["thinned"]
+    assert thinned["gaussians"][0] > thinned["gaussians"][1] == report["stages"][-1]["gaussians"]
     assert report["stages"][-1]["gaussians"] == sum(len(part.splat) for part in load_bundle(hinge_fit).parts)
 
 

@@ -57,7 +57,7 @@ class Effort:
 
 EFFORTS: dict[Quality, Effort] = {
     "draft": Effort(gaussians=4000, steps=450, part_steps=30, merge_steps=100, downscale=2),
-    "standard": Effort(gaussians=8000, steps=1000, part_steps=100, merge_steps=250),
+    "standard": Effort(gaussians=8000, steps=1000, part_steps=100, merge_steps=400),
     "high": Effort(gaussians=16000, steps=3000, part_steps=100, merge_steps=1500),
 }
 SMALLEST = 128

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from gsplat.strategy.ops import remove
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
@@ -31,9 +33,13 @@ from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import InitialMotion, initial_motion
+from splatart_ns.stages.thinning import BUDGET, MAX_VIEWS, ROUNDS, absences, expendable
 from splatart_ns.stages.unseen import may_have_turned
 from splatart_ns.stages.visibility import HIDDEN, clearest, visibility
 from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_views, world_record, world_sentence
+
+THINNING_STEPS = 25
+"""A round of thinning comes after every so many-th part of the steps on merged Gaussians."""
 
 
 @dataclass
@@ -307,11 +313,18 @@ class PosePipeline(VanillaPipeline):
             if step == self.model.config.pose_steps:
                 self._merge(optimizers)
 
+        apart = max(1, (steps - self.model.config.pose_steps) // THINNING_STEPS)
+
+        def thin(step: int) -> None:
+            turn, rest = divmod(step - self.model.config.pose_steps, apart)
+            if rest == 0 and 0 <= turn < ROUNDS:
+                self._thin(turn, optimizers)
+
         def count(step: int) -> None:
             self.model.step = step
 
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-        return [TrainingCallback(before, merge), TrainingCallback(before, count)]
+        return [TrainingCallback(before, function) for function in (merge, thin, count)]
 
     @torch.no_grad()
     def _merge(self, optimizers: Optimizers) -> None:
@@ -335,6 +348,40 @@ class PosePipeline(VanillaPipeline):
         optimizers.schedulers.pop("part_poses", None)  # they are final
         model.state_ids = torch.zeros(len(merged), dtype=torch.long, device=model.device)
         model.merged = torch.tensor(True, device=model.device)
+
+    @torch.no_grad()
+    def _thin(self, turn: int, optimizers: Optimizers) -> None:
+        """One of the rounds in which merged Gaussians go that the images hardly miss."""
+        start, model = time.perf_counter(), self.model
+        absence, error = self._absence(turn)
+        if turn == 0:
+            self._error = error
+            self.findings["thinned"] = {"gaussians": [model.num_points] * 2, "added_error": 0.0, "seconds": 0.0}
+        told = self.findings["thinned"]
+        budget = (turn + 1) / ROUNDS * BUDGET - told["added_error"]
+        goes = expendable(absence, model.splat.part_ids, budget * self._error)
+        remove(model.gauss_params, {name: optimizers.optimizers[name] for name in model.gauss_params}, {}, goes)
+        model.state_ids = model.state_ids[~goes]
+        told["gaussians"][1] = model.num_points
+        told["added_error"] += float(absence[goes].sum()) / self._error
+        told["seconds"] = round(told["seconds"] + time.perf_counter() - start, 2)
+
+    def _absence(self, turn: int) -> tuple[Tensor, float]:
+        """What `absences` finds in some views of all states, others in each turn."""
+        model = self.model
+        splat, T = model.splat.detach(), model.poses.T()
+        ids, known = splat.part_ids, model.covariance.isfinite().flatten(2).all(-1)
+        views = [(s, view) for s, views in enumerate(self.views) for view in views]
+        every = -(-len(views) // MAX_VIEWS)
+        absence, error = torch.zeros(len(splat), device=model.device), 0.0
+        for s in range(model.num_states):
+            chosen = [view for of, view in views[turn % every :: every] if of == s]
+            shown = torch.cat([known.new_ones(1), known[s]])[ids]
+            moved = splat.select(shown).transformed(torch.cat([torch.eye(4).to(T)[None], T[s]])[ids[shown]])
+            missed, had = absences(moved, chosen, self.config.seed + turn)
+            absence[shown] += missed
+            error += had
+        return absence, error
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         return {**super().get_param_groups(), "part_poses": list(self.model.poses.parameters())}

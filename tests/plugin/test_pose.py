@@ -9,6 +9,7 @@ from nerfstudio.engine.trainer import Trainer
 from splatart_ns.capture.check import require_valid
 from splatart_ns.errors import InputError
 from splatart_ns.method_configs.pose import method as pose_method
+from splatart_ns.stages.thinning import BUDGET, LARGEST_SHARE, ROUNDS
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +111,34 @@ def test_gaussians_wait_for_the_poses_or_learn_along(pose_trainer, learn):
     assert torch.equal(seen["colours"], colours) == (learn == "after")
     assert model.merged and model.poses.rotation.abs().max() == 0
     assert torch.isfinite(model.covariance).all()
+
+
+def test_merged_gaussians_that_the_images_hardly_miss_go_and_the_report_tells(pose_trainer, monkeypatch):
+    def known(splats, views, T, *_):
+        return T, torch.zeros(*T.shape[:2], 6, 6), torch.full((2, 2), torch.nan)
+
+    monkeypatch.setattr("splatart_ns.plugin.pose.refine_known_poses", known)
+    trainer = pose_trainer(steps=6, pose_steps=0, init="centroids")
+    trainer.train()
+    model, told = trainer.pipeline.model, trainer.pipeline.findings["thinned"]
+    before, after = told["gaussians"]
+    assert after == model.num_points == len(model.state_ids)
+    assert (1 - LARGEST_SHARE) ** ROUNDS * before <= after < 0.95 * before
+    assert 0 < told["added_error"] <= BUDGET and told["seconds"] > 0
+    assert set(model.splat.part_ids.tolist()) == {1, 2}
+    for name, parameter in model.gauss_params.items():
+        (trained,) = trainer.optimizers.optimizers[name].param_groups[0]["params"]
+        assert trained is parameter and len(parameter) == after
+
+
+def test_what_a_state_does_not_show_is_not_missed_there(pose_trainer):
+    pipeline = pose_trainer(init="centroids").pipeline
+    model = pipeline.model
+    whole, _ = pipeline._absence(0)
+    model.covariance[1, 1] = torch.nan
+    absence, _ = pipeline._absence(0)
+    lid = model.splat.part_ids == 2
+    assert absence[lid].sum() < whole[lid].sum() and absence[lid].any()
 
 
 def test_a_part_is_not_shown_in_a_state_where_its_pose_is_not_known(pose_trainer):
