@@ -16,6 +16,7 @@ from splatart_ns.geometry.se3 import inverse
 from splatart_ns.geometry.similarity import inverse_similarity, view_of_moved
 from splatart_ns.rasterize.rasterization import rasterization, sh_colors
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.light import difference_in_even_light
 from splatart_ns.stages.threads import side_by_side
 
 Measure = TypeVar("Measure")
@@ -67,12 +68,21 @@ class PartView:
         return torch.cat([image, accumulation], -1)
 
     def difference(
-        self, splat: Splat, T: Tensor, chroma_weight: float = RGB_WEIGHT, brightness_weight: float = RGB_WEIGHT
+        self,
+        splat: Splat,
+        T: Tensor,
+        chroma_weight: float = RGB_WEIGHT,
+        brightness_weight: float = RGB_WEIGHT,
+        even_light: bool = False,
     ) -> Tensor:
         """How the splat under motions [K, 4, 4] differs from the part [K, H, W, 4]."""
-        difference = self.render(splat, T) - self.rgba
+        rendered = self.render(splat, T)
+        difference = rendered - self.rgba
         brightness = difference[..., :3].mean(-1, keepdim=True)
-        difference[..., :3] = brightness_weight * brightness + chroma_weight * (difference[..., :3] - brightness)
+        chroma = difference[..., :3] - brightness
+        if even_light:
+            brightness = difference_in_even_light(rendered, self.rgba, self.weight)
+        difference[..., :3] = brightness_weight * brightness + chroma_weight * chroma
         return difference
 
 
@@ -163,6 +173,8 @@ class PartPair:
     """Root mean square distance of the part's Gaussians from the centroid."""
     chroma_weight: float = RGB_WEIGHT
     brightness_weight: float = RGB_WEIGHT
+    even_light: bool = False
+    """Whether brightness is compared as if both states were lit alike (see `light`)."""
 
     @property
     def area(self) -> float:
@@ -182,7 +194,9 @@ class PartPair:
         @torch.no_grad()
         def look(seen: tuple[Splat, PartView, Tensor]) -> Measure:
             splat, view, motion = seen
-            return measure(view.difference(splat, motion, self.chroma_weight, self.brightness_weight), view.weight)
+            return measure(
+                view.difference(splat, motion, self.chroma_weight, self.brightness_weight, self.even_light), view.weight
+            )
 
         return side_by_side(look, looks)
 

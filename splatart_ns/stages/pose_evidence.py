@@ -21,6 +21,8 @@ from splatart_ns.stages.symmetry import settle_turn
 ALL_VIEWS = 60
 """Views of each state that the last refinement looks at, where there are so many."""
 MAX_ITERATIONS = 8
+IN_EVEN_LIGHT = {"chroma_weight": CHROMA_WEIGHT, "brightness_weight": 1.0, "even_light": True}
+"""How that looks at a `PartPair`."""
 MAYBE_SLIDING = math.radians(10)
 """A part that turned less than this against another may be sliding: thin parts' turns are known no better."""
 
@@ -31,8 +33,9 @@ def refine_poses(
     """The last rung of the search for poses: Gauss-Newton on all views, and the certainty that they give.
 
     Few views leave the turn of a round part to chance, and the brightness of a photometric loss misleads it, because
-    light stays in the world while parts turn; silhouettes and hues of all views hold it. A round part's turn about its
-    own axis is settled by trying all of them (`settle_turn`), also where the pose is to stay as it is.
+    light stays in the world while parts turn; silhouettes, hues and, in even light, brightness of all views hold it. A
+    round part's turn about its own axis is settled by trying all of them (`settle_turn`), also where the pose is to
+    stay as it is.
 
     Where a part rests, one that slides past it does not turn: what it seems to turn by is error, which its shift makes
     up for. So parts whose images fit a mere shift as well are held to that.
@@ -59,7 +62,7 @@ def refine_poses(
             if pair is None:
                 covariances[s, p] = torch.nan
                 continue
-            pair, equations = replace(pair, chroma_weight=CHROMA_WEIGHT), None
+            pair, equations = replace(pair, **IN_EVEN_LIGHT), None
             if not frozen[s, p]:
                 found = refine(pair, T[s, p], MAX_ITERATIONS, central=central)
                 T[s, p], equations = found.T, found.equations

@@ -52,15 +52,15 @@ def test_a_part_that_slides_past_one_that_rests_is_held_unturned_and_one_that_tu
         assert (T[1, 1, :3, 3] - truth[:3, 3]).norm() < 0.01
 
 
-def test_the_last_refinement_looks_at_hues(monkeypatch):
+def test_the_last_refinement_looks_at_hues_and_at_brightness_in_even_light(monkeypatch):
     """What it gains was measured on fits (README); a scene as small as this one is held by its silhouettes."""
-    weights = []
+    looks = []
 
     def watched(pair, *args, **options):
-        weights.append(pair.chroma_weight)
+        looks.append((pair.chroma_weight, pair.brightness_weight, pair.even_light))
         return refine(pair, *args, **options)
 
     monkeypatch.setattr(pose_evidence, "refine", watched)
     truth = motion((0, 0, 20), (0.1, 0.0, 0.0))
     refine_poses(*two_states(truth), poses_of(truth), torch.tensor([[True, True], [True, False]]))
-    assert weights == [CHROMA_WEIGHT]
+    assert looks == [(CHROMA_WEIGHT, 1.0, True)]
