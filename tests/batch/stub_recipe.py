@@ -51,7 +51,8 @@ class StubRecipe:
             result = {"texts": texts}, []
         elif kind == "copy":
             (work.folder / "copies").mkdir()
-            (work.folder / "copies" / name).write_text(work.outcome("look")["texts"][name].upper())
+            text = work.outcome("look")["texts"][name].upper()
+            (work.folder / "copies" / name).write_text(text, errors="backslashreplace")
             result = (
                 {"threads": os.environ["OMP_NUM_THREADS"], "gpu": os.environ.get("CUDA_VISIBLE_DEVICES", "")},
                 [f"copies/{name}"],
