@@ -164,10 +164,9 @@ def test_a_sweep_moves_the_joint_there_and_back(render, tmp_path):
     assert len(list(folder.iterdir())) == 6
     for frame in frames:
         assert_shows_an_object(frame)
-    changes = [np.abs(frame - frames[0]).mean() for frame in frames]
-    assert changes[3] == max(changes) > 2
-    assert changes[1] == pytest.approx(changes[5], abs=0.1)
-    assert 0 < changes[1] < changes[2] < changes[3]
+    # There in three steps that all show, and back the same way.
+    assert min(np.abs(a - b).mean() for a, b in zip(frames[:3], frames[1:4], strict=True)) > 2
+    assert np.abs(frames[1] - frames[5]).mean() < 0.1 and np.abs(frames[2] - frames[4]).mean() < 0.1
 
 
 def test_a_trajectory_is_followed_row_by_row(render, tmp_path):

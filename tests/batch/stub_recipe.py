@@ -54,7 +54,7 @@ class StubRecipe:
             text = work.outcome("look")["texts"][name].upper()
             (work.folder / "copies" / name).write_text(text, errors="backslashreplace")
             result = (
-                {"threads": os.environ["OMP_NUM_THREADS"], "gpu": os.environ.get("CUDA_VISIBLE_DEVICES", "")},
+                {"threads": os.environ.get("OMP_NUM_THREADS", ""), "gpu": os.environ.get("CUDA_VISIBLE_DEVICES", "")},
                 [f"copies/{name}"],
             )
         else:
