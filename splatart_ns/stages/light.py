@@ -7,8 +7,9 @@ what is left of the brightness once its mean over a few pixels agrees says where
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import pad
 
 REACH = 2
 """Pixels to each side over which a mean goes, twice."""
@@ -24,19 +25,27 @@ def difference_in_even_light(rgba: Tensor, wanted: Tensor, weight: Tensor) -> Te
     Both are colours over black with their silhouettes, 0..1. Pixels of `weight` [H, W] 0 count in no mean. Towards the
     silhouettes, where means have little to go by, the difference fades.
     """
-    weight = weight[..., None]
-    (bright, shown), (bright_wanted, shown_wanted) = (
-        (x[..., :3].mean(-1, keepdim=True), _mean(x[..., 3:] * weight)) for x in (rgba, wanted[None])
-    )
-    light = _mean(bright * weight) / (shown + DARK) + DARK
-    light_wanted = _mean(bright_wanted * weight) / (shown_wanted + DARK) + DARK
-    gain = (light_wanted / light).clamp(1 / MOST, MOST)
-    return (gain * bright - bright_wanted) * (shown * shown_wanted)
+    bright, shown, light = _lit(rgba, weight)
+    bright_wanted, shown_wanted, light_wanted = _lit(wanted[None], weight)
+    gain = (light_wanted / light).clamp_(1 / MOST, MOST)
+    return gain.mul_(bright).sub_(bright_wanted).mul_(shown).mul_(shown_wanted)[..., None]
+
+
+def _lit(rgba: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of pictures [K, H, W, 4] their brightness, how much of the part is around, and how it is lit there: [K, H, W]."""
+    red, green, blue, alpha = rgba.unbind(-1)
+    bright = (red + green).add_(blue).div_(3)
+    around, shown = _mean(torch.stack([bright, alpha]).mul_(weight))
+    return bright, shown, (around / (shown + DARK)).add_(DARK)
 
 
 def _mean(x: Tensor) -> Tensor:
-    """Means [K, H, W, 1] over squares, twice; outside is 0."""
-    x = x.movedim(-1, 1)
-    for _ in range(2):
-        x = avg_pool2d(x, 2 * REACH + 1, 1, REACH)
-    return x.movedim(1, -1)
+    """Means [..., H, W] over squares, twice; outside is 0. Shifted pictures are added: pooling takes 5 times longer."""
+    for dim, sides in ((-1, (REACH, REACH)), (-2, (0, 0, REACH, REACH))):
+        for _ in range(2):
+            padded, size = pad(x, sides), x.shape[dim]
+            x = padded.narrow(dim, 0, size).clone()
+            for shift in range(1, 2 * REACH + 1):
+                x += padded.narrow(dim, shift, size)
+            x /= 2 * REACH + 1
+    return x
