@@ -50,7 +50,7 @@ SIMILAR_TURN = 1.5
 """A mere turn is preferred to a motion that is none where it costs less than this many times as much."""
 ALIKE = 1.25
 """Motions that cost less than this many times the chosen one render as well: plain square knobs turned by 90 degrees
-more measured 1.08 to 1.18, hexagonal ones 1.03 to 1.12, other parts that are seen well above 4."""
+more measured 1.08 to 1.18, hexagonal ones 1.03 to 1.12, other parts that are seen well above 2."""
 STILL_RATIO = 1.2
 """A part whose images fit no motion worse than this many times the best motion did not move."""
 
@@ -136,6 +136,7 @@ def initial_motion(
 def looks_alike(T: np.ndarray, cost: np.ndarray, chosen: int, other: int) -> bool:
     """Whether of motions [C, 4, 4] that cost [C] the `other` turns the part quite otherwise and renders as well."""
     turned = Rotation.from_matrix(T[chosen, :3, :3].T @ T[other, :3, :3]).magnitude()
+    # Half of what is quite another one: a hexagonal part looks alike after 60 degrees.
     return bool(turned > OTHERWISE / 2 and cost[other] < ALIKE * cost[chosen])
 
 

@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from fuzzing import damaged_bytes, damaged_json, fuzzed
+from fuzzing import damaged_bytes, damaged_json, fuzzed, one_sentence
 from hypothesis import given
 from hypothesis import strategies as st
 from stub_recipe import StubRecipe
@@ -26,14 +26,6 @@ from splatart_ns.shape import has_shape
 SETTINGS = {"quality": "standard", "root": None, "seed": 0, "joints": []}
 CSV = "path,name,quality,root,seed,joints\ncaps/a,,,,,\n/b,bee,draft,base,7,lid:base=revolute; knob:lid\n"
 ROW = {"path": "b", "name": "x/y", "quality": "high", "root": "base", "seed": 3, "joints": ["lid:base"]}
-
-
-def one_sentence(function, *arguments):
-    try:
-        return function(*arguments)
-    except InputError as error:
-        assert "\n" not in str(error) and ";" in str(error)
-        return None
 
 
 def sound(entries):

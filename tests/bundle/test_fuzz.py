@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 import torch
-from fuzzing import damaged_bytes, damaged_json, fuzzed
+from fuzzing import damaged_bytes, damaged_json, fuzzed, one_sentence
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -25,14 +25,6 @@ from splatart_ns.splats.ply import read_ply
 def folder(bundle, tmp_path):
     save_bundle(bundle, tmp_path / "bundle")
     return tmp_path / "bundle"
-
-
-def one_sentence(function, path):
-    try:
-        return function(path)
-    except InputError as error:
-        assert str(error).isprintable() and ";" in str(error)
-        return None
 
 
 @given(data=st.data())

@@ -10,6 +10,8 @@ from typing import Any
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
+from splatart_ns.errors import InputError
+
 EXAMPLES = int(os.environ.get("SPLATART_FUZZ_EXAMPLES", "30"))
 
 
@@ -71,3 +73,13 @@ def damaged_json(draw: st.DrawFn, value: Any) -> bytes:
             parent.append(place)
     data = json.dumps(value).encode()
     return draw(damaged_bytes(data)) if draw(st.integers(0, 9)) == 0 else data
+
+
+def one_sentence(function, *arguments) -> Any:
+    """The result, or None where the input was refused by an `InputError` of one line with its mend."""
+    try:
+        return function(*arguments)
+    except InputError as error:
+        message = str(error)
+        assert message.isprintable() and ";" in message, message
+        return None

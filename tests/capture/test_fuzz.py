@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from fuzzing import EXAMPLES, damaged_bytes, damaged_json, fuzzed
+from fuzzing import EXAMPLES, damaged_bytes, damaged_json, fuzzed, one_sentence
 from hypothesis import given
 from hypothesis import strategies as st
 from label_exports import write_coco, write_masks, write_yolo
@@ -57,16 +57,6 @@ POINTS = [
     trimesh.PointCloud(RNG.random((20, 3)), colors=pixels(20, 4)).export(file_type="ply", encoding=encoding)
     for encoding in ("binary", "ascii")
 ]
-
-
-def one_sentence(function, *arguments):
-    """The result, or None where the input was refused by an `InputError` of one line."""
-    try:
-        return function(*arguments)
-    except InputError as error:
-        message = str(error)
-        assert message.endswith(".") and "\n" not in message.split("is not JSON")[0]
-        return None
 
 
 @given(data=st.sampled_from(IMAGES).flatmap(damaged_bytes))

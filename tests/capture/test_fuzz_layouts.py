@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 import pytest
 import yaml
-from fuzzing import EXAMPLES, damaged_bytes, damaged_json, fuzzed
+from fuzzing import EXAMPLES, damaged_bytes, damaged_json, fuzzed, one_sentence
 from hypothesis import given
 from hypothesis import strategies as st
 from small_capture import SIZE, pose, write_images, write_state
@@ -21,16 +21,6 @@ from splatart_ns.capture.segmenter import segment
 from splatart_ns.capture.values import read_yaml
 from splatart_ns.errors import InputError
 from splatart_ns.plain_yaml import parse_yaml
-
-
-def one_sentence(function, *arguments):
-    """The result, or None where the input was refused by an `InputError` of one line."""
-    try:
-        return function(*arguments)
-    except InputError as error:
-        message = str(error)
-        assert message.endswith(".") and message.isprintable()
-        return None
 
 
 def sound(capture):

@@ -6,7 +6,7 @@ import shutil
 from importlib import import_module
 
 import pytest
-from fuzzing import EXAMPLES, damaged_bytes, damaged_json, fuzzed
+from fuzzing import EXAMPLES, damaged_bytes, damaged_json, fuzzed, one_sentence
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,14 +15,6 @@ from splatart_ns.errors import InputError
 from splatart_ns.evaluation.evaluate import evaluate
 from splatart_ns.evaluation.ground_truth import load_ground_truth
 from splatart_ns.evaluation.tables import format_tables
-
-
-def one_sentence(function, *arguments):
-    try:
-        return function(*arguments)
-    except InputError as error:
-        assert str(error).isprintable() and ";" in str(error)
-        return None
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from fuzzing import damaged_bytes, damaged_json, fuzzed
+from fuzzing import damaged_bytes, damaged_json, fuzzed, one_sentence
 from hypothesis import given
 
 from splatart_ns.errors import InputError
@@ -15,15 +15,6 @@ from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_c
 from splatart_ns.plugin.fit import Report, Settings
 from splatart_ns.plugin.gaussians import SPLAT_SHAPES, splat_from_state
 from splatart_ns.plugin.semantic_run import find_semantic_runs
-
-
-def one_sentence(function, *arguments):
-    try:
-        return function(*arguments)
-    except InputError as error:
-        assert str(error).isprintable() and ";" in str(error)
-        return None
-
 
 CONFIG = """!!python/object:splatart_ns.plugin.joint.JointTrainerConfig
 method_name: splatart-semantic
