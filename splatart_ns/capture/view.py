@@ -27,6 +27,13 @@ from splatart_ns.capture.images import (
 )
 from splatart_ns.errors import InputError
 
+Window = tuple[int, int, int, int]
+"""A piece of an image: left, top, right, bottom, in pixels; the last two are one past it."""
+MARGIN = 16
+"""Pixels around an object that are looked at too."""
+GRAIN = 8
+"""A piece begins at a multiple of so many pixels, so that one of smaller images does."""
+
 
 @dataclass
 class View:
@@ -60,6 +67,31 @@ class View:
             return rgb
         alpha = self.alpha.float()[..., None] / 255
         return rgb * alpha + background * (1 - alpha)
+
+    def object_window(self) -> Window:
+        """The piece that shows the object and a margin, from a multiple of `GRAIN` to a multiple of it or the border;
+        all of an image without an alpha, or without the object."""
+        shown = None if self.alpha is None else self.alpha > 0
+        if shown is None or not shown.any():
+            return 0, 0, self.width, self.height
+        bounds = []
+        for along, size in ((shown.any(0), self.width), (shown.any(1), self.height)):
+            inside = along.nonzero()
+            low, high = int(inside.min()) - MARGIN, int(inside.max()) + 1 + MARGIN
+            bounds.append((max(0, low // GRAIN * GRAIN), min(size, -(-high // GRAIN) * GRAIN)))
+        (left, right), (top, bottom) = bounds
+        return left, top, right, bottom
+
+    def cropped(self, window: Window) -> View:
+        """The piece of the view in a window."""
+        left, top, right, bottom = window
+        K = self.K.clone()
+        K[0, 2] -= left
+        K[1, 2] -= top
+        pixels = (self.rgb, self.alpha, self.labels, self.mask)
+        rgb, alpha, labels, mask = (None if x is None else x[top:bottom, left:right] for x in pixels)
+        size = {"width": right - left, "height": bottom - top}
+        return replace(self, K=K, rgb=rgb, alpha=alpha, labels=labels, mask=mask, **size)
 
 
 def load_views(capture: Capture, state: int | State, split: str = "train", downscale: int = 1) -> list[View]:

@@ -8,11 +8,12 @@ from functools import cached_property
 from typing import Any
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
 from splatart_ns.capture.capture import UNLABELLED, Capture
-from splatart_ns.capture.view import View, load_points, load_view
+from splatart_ns.capture.view import View, Window, load_points, load_view
 from splatart_ns.stages.hull import SeedPoints, seed_points, slack, visual_hull
 from splatart_ns.stages.silhouette import with_silhouette
 from splatart_ns.stages.surroundings import surrounding_points
@@ -60,8 +61,9 @@ class SplatartDatamanagerConfig(FullImageDatamanagerConfig):
 
     _target: type = field(default_factory=lambda: SplatartDatamanager)
     seed_gaussians: int = 0
-    """Number of points inside the silhouettes to start Gaussians from, when the capture has no point cloud; and, where
-    images are opaque, at most so many on what surrounds the object, from the point cloud if there is one."""
+    """Most points inside the silhouettes to start Gaussians from, when the capture has no point cloud; small objects
+    get fewer. And, where images are opaque, at most so many on what surrounds the object, from the point cloud if there
+    is one."""
     seed: int = 0
     """Seed of those points."""
 
@@ -96,14 +98,38 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
             around = surrounding_points(views, count, generator) if points is None else points.drawn(count, generator)
             points = seed_points(outlined, num_parts, count, generator, visual_hull(outlined)) if outlined else None
             if points is not None:
+                self.train_dataset.metadata["points3D_inside"] = len(points.xyz)
                 points = points.joined(around)
                 self.train_dataset.metadata["points3D_around"] = len(around.xyz)
         else:
             self.slack, hull = slack(views)
             if points is None:
                 points = seed_points(views, num_parts, count, generator, hull)
+                if points is not None:
+                    self.train_dataset.metadata["points3D_inside"] = len(points.xyz)
         if points is not None:
             self.train_dataparser_outputs.metadata.update(points3D_xyz=points.xyz, points3D_rgb=points.rgb)
+
+    def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
+        """A training frame and its camera: the piece around the object, where the image says which that is.
+
+        The camera's metadata have the `whole` width and height, the data which `share` of its pixels the piece has.
+        """
+        camera, data = super().next_train(step)
+        left, top, right, bottom = self._windows[data["image_idx"]]
+        width, height = int(camera.width), int(camera.height)
+        camera.metadata["whole"] = width, height
+        data["share"] = (right - left) * (bottom - top) / (width * height)
+        camera.cx, camera.cy = camera.cx - left, camera.cy - top
+        camera.width, camera.height = (torch.full_like(camera.width, x) for x in (right - left, bottom - top))
+        for name in ("image", "semantics", "mask"):
+            if name in data:
+                data[name] = data[name][top:bottom, left:right]
+        return camera, data
+
+    @cached_property
+    def _windows(self) -> list[Window]:
+        return [view.object_window() for view in self.train_dataset.views]
 
     def _load_images(self, split, cache_images_device):
         # Pinning needs an accelerator; without one "cpu" and "gpu" are the same memory anyway.

@@ -120,6 +120,11 @@ class SplatartModel(SplatfactoModel):
             splat, camera, parts=not self.training, depth=self.config.output_depth_during_training or not self.training
         )
         self.info = rendering.info
+        if "whole" in (camera.metadata or {}):  # the strategy measures in shares of the image
+            factor = self._get_downscale_factor()
+            self.info |= {
+                side: x // factor for side, x in zip(("width", "height"), camera.metadata["whole"], strict=True)
+            }
         accumulation = rendering.accumulation[0]
         background = self._get_background_color()
         outputs = {
@@ -141,7 +146,7 @@ class SplatartModel(SplatfactoModel):
         if self.training and self.step % 10 != 0:  # nerfstudio logs every tenth step and asks at each
             return {"gaussian_count": self.num_points}
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-        mse = (outputs["rgb"].detach() - target).square().mean()
+        mse = batch.get("share", 1.0) * (outputs["rgb"].detach() - target).square().mean()
         metrics = {"psnr": -10 * mse.clamp_min(1e-10).log10(), "gaussian_count": self.num_points}
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics

@@ -35,7 +35,7 @@ from splatart_ns.stages.reference import reference_states, refine_known_poses, s
 from splatart_ns.stages.render_choice import InitialMotion, initial_motion
 from splatart_ns.stages.thinning import BUDGET, MAX_VIEWS, ROUNDS, absences, expendable
 from splatart_ns.stages.unseen import may_have_turned
-from splatart_ns.stages.visibility import HIDDEN, clearest, visibility
+from splatart_ns.stages.visibility import HIDDEN, looked_at
 from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_views, world_record, world_sentence
 
 THINNING_STEPS = 25
@@ -152,7 +152,9 @@ class PosePipeline(VanillaPipeline):
         self._cameras_refined = any(state.cameras_refined for state in states)
         splats = [state.splat.select(state.splat.part_ids > 0) for state in states]
         # What lies behind the front of a shut drawer comes to light when the drawer moves, and is nothing but haze.
-        splats = [s.select(clearest(s, v) >= HIDDEN) for s, v in zip(splats, self.views, strict=True)]
+        looks = [looked_at(splat, views) for splat, views in zip(splats, self.views, strict=True)]
+        splats = [splat.select(share >= HIDDEN) for splat, (_, share) in zip(splats, looks, strict=True)]
+        self._seen = [seen[share >= HIDDEN] for seen, share in looks]
         self.model.worlds = torch.from_numpy(np.stack([state.placement for state in capture.states])).to(device)
         if capture.worlds != "shared":
             self._bring_together(splats, capture)
@@ -165,10 +167,9 @@ class PosePipeline(VanillaPipeline):
     def _bring_together(self, splats: list[Splat], capture: Capture) -> None:
         """Move splats and views of all states into the world of state 0."""
         P = self.model.num_parts
-        seen = [visibility(s, v) for s, v in zip(splats, self.views, strict=True)]
         root = next((p for p, name in capture.parts.items() if name == self.config.root), None)
-        parts = anchors(splats, seen, P) if root is None else [root]
-        found = fit_worlds(splats, self.views, seen, parts, capture.worlds == "similar", self.config.seed)
+        parts = anchors(splats, self._seen, P) if root is None else [root]
+        found = fit_worlds(splats, self.views, self._seen, parts, capture.worlds == "similar", self.config.seed)
         if found is None:
             raise InputError(
                 f"{capture.path}: no part is seen well enough in all states to bring their worlds together; label "
@@ -196,15 +197,14 @@ class PosePipeline(VanillaPipeline):
             centroids = torch.stack([part_extents(s, P)[0].cpu() for s in splats])
             M[..., :3, 3] = centroids - centroids[0]
             return M
-        seen = [visibility(s, v) for s, v in zip(splats, self.views, strict=True)]
         # Where cameras were refined, each state has kept the mean error of its own: what rests seems to move by that.
         snap = self.config.snap and not self._cameras_refined
-        self._reference = reference_states(splats, seen, P)
+        self._reference = reference_states(splats, self._seen, P)
         for p, first in enumerate(self._reference):
             for s in range(S):
                 if s == first:
                     continue
-                pair = [(everything[first], everything[s]) for everything in (splats, self.views, seen)]
+                pair = [(everything[first], everything[s]) for everything in (splats, self.views, self._seen)]
                 motion = initial_motion(*pair, p + 1, self.config.seed)
                 M[s, p] = motion.T.cpu()
                 self._known[s, p] = motion.found
@@ -258,23 +258,25 @@ class PosePipeline(VanillaPipeline):
                         queues[target] = rng.sample(self.views[target], len(self.views[target]))
                     yield source, target, queues[target].pop()
 
-    def _shuffled_views(self) -> Iterator[tuple[int, View]]:
-        """(state, view): every view of every state before any again."""
+    def _shuffled_views(self) -> Iterator[tuple[int, View, float]]:
+        """(state, view, share): the piece around the object of every view of every state before any again, and its
+        share of the image."""
         rng = random.Random(self.config.seed)
+        pieces = [(s, v, v.cropped(v.object_window())) for s, views in enumerate(self.views) for v in views]
+        everything = [(s, piece, piece.alpha.numel() / v.alpha.numel()) for s, v, piece in pieces]
         while True:
-            everything = [(s, v) for s, views in enumerate(self.views) for v in views]
             yield from rng.sample(everything, len(everything))
 
     def get_train_loss_dict(self, step: int):
         model = self.model
-        T = model.poses.T()
         losses: dict[str, Tensor] = {}
         background = torch.rand(3, device=model.device)
         if model.merged:
-            state, view = next(self._own)
-            shots = [(model.splat_at(state, T.detach()), view)]
+            # Beside the piece that shows the object nothing is wrong: the means are those over the whole image.
+            state, view, share = next(self._own)
+            shots = [(model.splat_at(state, model.poses.base), view)]  # final: a merger has committed them
         else:
-            shots = []
+            shots, share, T = [], 1.0, model.poses.T()
             for _ in range(2):
                 source, target, view = next(self._pairs)
                 shots.append((carry({source: self._moving_splat(source)}, T, source, target), view))
@@ -289,7 +291,7 @@ class PosePipeline(VanillaPipeline):
                 with_depth=False,
             )
             for name, loss in pose_loss(rendering, view, model.config.loss_weights, background).items():
-                losses[name] = losses.get(name, 0) + loss / len(shots)
+                losses[name] = losses.get(name, 0) + share * loss / len(shots)
         return {}, losses, {"gaussian_count": model.num_points}
 
     def _moving_splat(self, state: int) -> Splat:
@@ -338,7 +340,8 @@ class PosePipeline(VanillaPipeline):
         known = model.covariance.isfinite().flatten(2).all(-1)
         self._note_unknown(known)
         self._note_turned(model.covariance)
-        merged = Splat.cat(merge_parts(splats, self.views, T, known))
+        seen = self._seen if model.config.learn_gaussians == "after" else None
+        merged = Splat.cat(merge_parts(splats, self.views, T, known, seen))
         params = gauss_params_from_splat(merged)
         for name, parameter in params.items():
             model.gauss_params[name] = parameter

@@ -56,7 +56,8 @@ class SemanticModelConfig(SplatartModelConfig):
     vote_init: bool = True
     """Whether the logits start from the labels' votes, counted in one backward pass a labelled view."""
     max_gaussians: int = 12000
-    """Gaussians are not split or duplicated beyond this number, and 3 / 2 of those that start on the surroundings."""
+    """Gaussians are not split or duplicated beyond this number, nor beyond 3 / 2 of those that start inside the
+    silhouettes, and 3 / 2 of those that start on the surroundings."""
     background_color: Literal["random", "black", "white"] = "random"
     refine_cameras: RefineCameras = "auto"
     """Whether the cameras' poses are refined while geometry and colour learn; auto: if no hull fits the images."""
@@ -95,6 +96,8 @@ class SemanticModel(SplatartModel):
             verbose=False,
         )
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
+        # Points that were as many as the object's pixels can teach grow in proportion.
+        self._most = 3 * self.kwargs["metadata"].get("points3D_inside", config.max_gaussians) // 2
         self._for_surroundings = 3 * self.kwargs["metadata"].get("points3D_around", 0) // 2
         # World to camera, OpenCV axes, of the training frames as they were last refined.
         self.register_buffer("viewmats", torch.eye(4, dtype=torch.float64).repeat(self.num_train_data, 1, 1))
@@ -143,7 +146,7 @@ class SemanticModel(SplatartModel):
 
     def _limit_growth(self) -> None:
         """Raise the strategy's threshold so that only the neediest Gaussians that there is room for grow."""
-        room = self.config.max_gaussians + self._for_surroundings - self.num_points
+        room = min(self.config.max_gaussians, self._most) + self._for_surroundings - self.num_points
         self.strategy.grow_grad2d = self.config.densify_grad_thresh
         if self.strategy_state["count"] is None or room >= self.num_points:
             return
@@ -163,7 +166,8 @@ class SemanticModel(SplatartModel):
         """Colour and accumulation losses in the first phase, cross-entropy of the parts in the second."""
         if self.training and self.learns_parts:
             labels = batch["semantics"][..., 0].to(self.device)
-            return {"segmentation": segmentation_loss(outputs["part_probabilities"], self._downscale_labels(labels))}
+            wrong = segmentation_loss(outputs["part_probabilities"], self._downscale_labels(labels))
+            return {"segmentation": batch["share"] * wrong}
         image = self.get_gt_img(batch["image"])
         target = self.composite_with_background(image, outputs["background"])
         rgb, accumulation = outputs["rgb"], outputs["accumulation"][..., 0]
@@ -176,6 +180,8 @@ class SemanticModel(SplatartModel):
             if "mask" in batch:
                 alpha, accumulation = alpha * mask[..., 0], accumulation * mask[..., 0]
             losses["accumulation"] = self.config.accumulation_weight * accumulation_loss(accumulation, alpha)
+        # Beside the piece that shows the object nothing is wrong: the means are those over the whole image.
+        losses = {name: batch.get("share", 1.0) * loss for name, loss in losses.items()}
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
         return losses

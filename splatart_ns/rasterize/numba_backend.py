@@ -13,7 +13,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from splatart_ns.rasterize.numba_binning import bin_gaussians
-from splatart_ns.rasterize.numba_compositing import GROUP, composite, composite_backward, gather_gradients
+from splatart_ns.rasterize.numba_compositing import (
+    GROUP,
+    composite,
+    composite_backward,
+    composite_neighbours,
+    gather_gradients,
+)
 from splatart_ns.rasterize.numba_runtime import balanced_bounds, even_bounds, num_workers, run
 
 
@@ -34,6 +40,28 @@ def rasterize_to_pixels(
     threads is torch's; results do not depend on it, to the last bit.
     """
     return _Rasterize.apply(means2d, conics, opacities, colors, depths, visible, width, height, absgrad)
+
+
+def rasterize_neighbours(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    depths: Tensor,
+    visible: Tensor,
+    width: int,
+    height: int,
+) -> Tensor:
+    """Colours over black and accumulation [C, H, W, 4] of C cameras, all to first order about the first one's.
+
+    Arguments are those of `rasterize_to_pixels`, but opacities are [N] and colors [C, N, 3]. No gradients.
+    """
+    means_, conics_, colors_, visible_ = (_array(t) for t in (means2d, conics, colors, visible))
+    bins = bin_gaussians(means_[0], conics_[0], _array(opacities), _array(depths[0]), visible_[0], 1, width, height)
+    images = np.empty((len(colors), height, width, 4), np.float32)
+    bounds = balanced_bounds(bins.tile_offsets, num_workers())
+    run(composite_neighbours, bounds, bins, means_, conics_, colors_, visible_, images)
+    return torch.from_numpy(images)
 
 
 class _Rasterize(torch.autograd.Function):

@@ -21,7 +21,7 @@ _LOG2_ALPHA_MIN = np.float32(math.log2(1 / 255))
 _LOG2_ALPHA_MAX = np.float32(math.log2(0.999))
 _LN_2 = math.log(2)
 _T_MIN = np.float32(1e-4)
-_ZERO, _ONE = np.float32(0), np.float32(1)
+_ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 # Near-minimax fit of 2^f for f in [0, 1], relative error 7.5e-8.
 _E0, _E1, _E2 = np.float32(0.9999999250636943), np.float32(0.6931530731907609), np.float32(0.24015361712565741)
 _E3, _E4, _E5 = np.float32(0.05582631781272315), np.float32(0.00898934037714072), np.float32(0.0018775765567582148)
@@ -136,6 +136,93 @@ def composite(begin, end, worker, bins, colors, render, alphas, depths):
                     target[j, d] = plane[j]
             for j in range(wide):
                 alphas[camera, row * TILE + i, column * TILE + j, 0] = work[_A + i * TILE + j]
+
+
+@jit
+def composite_neighbours(begin, end, worker, bins, means, conics, colors, visible, images):
+    """Renders the tiles begin..end into images [C, H, W, 4], colours and accumulation, of a camera and of others near
+    it: to first order in what their means [C, G, 2], conics [C, G, 3] and colours [C, G, 3] differ by from the first's.
+
+    With s the difference of ln(alpha), a weight w = alpha t differs by w s + alpha dt, and dt then by minus that. That
+    supports end elsewhere is left out. Only the first camera's Gaussians are in the bins; where one is not visible
+    [C, G] to another camera, it stays there as it is.
+    """
+    tiles_x, tile_offsets, gaussians, coefficients = bins.tiles_x, bins.tile_offsets, bins.gaussians, bins.coefficients
+    cameras, height, width = images.shape[0], images.shape[1], images.shape[2]
+    work = _aligned(8 * PIXELS)
+    rates, right, down = work[5 * PIXELS :], work[6 * PIXELS :], work[7 * PIXELS :]
+    planes = _aligned(cameras * 4 * PIXELS).reshape((cameras, 4 * PIXELS))
+    first = planes[0]
+    for tile in range(begin, end):
+        row, column = tile // tiles_x, tile % tiles_x
+        left, top = column * TILE + 0.5, row * TILE + 0.5
+        _start_tile(work)
+        planes[:] = _ZERO
+        pair = tile_offsets[tile]
+        while pair < tile_offsets[tile + 1]:
+            g = gaussians[pair]
+            u0, y0, square, shear, drop, peak = _at_tile(coefficients[g], left, top)
+            x0 = np.float32(left - means[0, g, 0])
+            c0, c1, c2 = colors[0, g, 0], colors[0, g, 1], colors[0, g, 2]
+            for p in range(PIXELS):
+                dy = work[_Y + p] + y0
+                u = work[_X + p] + (shear * work[_Y + p] + u0)
+                log2_alpha = square * u * u + (drop * dy * dy + peak)
+                alpha = _alpha(log2_alpha)
+                t = work[_T + p]
+                weight = alpha * t
+                rest = t - weight
+                alive = rest > _T_MIN
+                weight = weight if alive else _ZERO
+                work[_T + p] = rest if alive else -abs(t)
+                work[_W + p] = weight
+                work[_A + p] = alpha if alive else _ZERO
+                rates[p] = _ZERO if log2_alpha > _LOG2_ALPHA_MAX else weight
+                right[p] = work[_X + p] + x0
+                down[p] = dy
+                first[p] += weight * c0
+                first[PIXELS + p] += weight * c1
+                first[2 * PIXELS + p] += weight * c2
+                first[3 * PIXELS + p] += weight
+            a, b, c = conics[0, g, 0], conics[0, g, 1], conics[0, g, 2]
+            for k in range(1, cameras):
+                if not visible[k, g]:
+                    continue
+                plane = planes[k]
+                x, y = means[k, g, 0] - means[0, g, 0], means[k, g, 1] - means[0, g, 1]
+                sx, sy, sxy = a * x + b * y, b * x + c * y, b - conics[k, g, 1]
+                sxx, syy = _HALF * (a - conics[k, g, 0]), _HALF * (c - conics[k, g, 2])
+                v0, v1, v2 = colors[k, g, 0] - c0, colors[k, g, 1] - c1, colors[k, g, 2] - c2
+                for p in range(PIXELS):
+                    dx, dy, weight = right[p], down[p], work[_W + p]
+                    t = plane[3 * PIXELS + p]
+                    s = dx * (sx + sxx * dx + sxy * dy) + dy * (sy + syy * dy)
+                    v = rates[p] * s + work[_A + p] * t
+                    plane[3 * PIXELS + p] = t - v
+                    plane[p] += v * c0 + weight * v0
+                    plane[PIXELS + p] += v * c1 + weight * v1
+                    plane[2 * PIXELS + p] += v * c2 + weight * v2
+            pair += 1
+            if pair & 7 == 0:
+                most = -_ONE
+                for p in range(PIXELS):
+                    most = max(most, work[_T + p])
+                if most < _ZERO:
+                    break
+        for k in range(1, cameras):  # what differs becomes what is seen
+            plane = planes[k]
+            for p in range(3 * PIXELS):
+                plane[p] += first[p]
+            for p in range(3 * PIXELS, 4 * PIXELS):
+                plane[p] = first[p] - plane[p]
+        wide = min(TILE, width - column * TILE)
+        for k in range(cameras):
+            for i in range(min(TILE, height - row * TILE)):
+                target = images[k, row * TILE + i, column * TILE :]
+                for d in range(4):
+                    plane = planes[k, d * PIXELS + i * TILE :]
+                    for j in range(wide):
+                        target[j, d] = plane[j]
 
 
 @jit

@@ -83,7 +83,7 @@ def _refined(splat: Splat, seen: PartView, given: Tensor, centroid: Tensor, radi
 
     steps = trial_steps(6, True, viewmat)
     motions = increment(eye.expand(len(steps), 4, 4), steps, centroid, radius)
-    H, g, cost = linearized(seen.difference(splat, motions), seen.weight, STEP, central=True)
+    H, g, cost = linearized(seen.difference(splat, motions, first_order=True), seen.weight, STEP, central=True)
     noise = 2 * cost / float(seen.weight.sum())
     r, after, before = far(motions).split([1, 6, 6])
     r, J = r[0], (after - before) / (2 * STEP)

@@ -33,9 +33,8 @@ def difference_in_even_light(rgba: Tensor, wanted: Tensor, weight: Tensor) -> Te
 
 def _lit(rgba: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of pictures [K, H, W, 4] their brightness, how much of the part is around, and how it is lit there: [K, H, W]."""
-    red, green, blue, alpha = rgba.unbind(-1)
-    bright = (red + green).add_(blue).div_(3)
-    around, shown = _mean(torch.stack([bright, alpha]).mul_(weight))
+    bright = rgba @ torch.tensor([1 / 3, 1 / 3, 1 / 3, 0]).to(rgba)
+    around, shown = _mean(torch.stack([bright, rgba[..., 3]]).mul_(weight))
     return bright, shown, (around / (shown + DARK)).add_(DARK)
 
 

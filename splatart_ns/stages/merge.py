@@ -20,7 +20,11 @@ COVERED = 3.0
 
 
 def merge_parts(
-    splats: Sequence[Splat], views: Sequence[Sequence[View]], T: Tensor, known: Tensor | None = None
+    splats: Sequence[Splat],
+    views: Sequence[Sequence[View]],
+    T: Tensor,
+    known: Tensor | None = None,
+    seen: Sequence[Tensor] | None = None,
 ) -> list[Splat]:
     """The splats of parts 1..P in the canonical frame, from all states.
 
@@ -30,11 +34,12 @@ def merge_parts(
         T: Poses [S, P, 4, 4].
         known: Which of them were found [S, P] bool, by default all. A part is not taken from a state where its pose was
             not.
+        seen: The `visibility` of each state's Gaussians, if it has been measured.
 
     Returns:
         One splat per part; empty for a part without Gaussians. Background and unseen Gaussians are gone.
     """
-    seen = [visibility(s, v) for s, v in zip(splats, views, strict=True)]
+    seen = seen or [visibility(s, v) for s, v in zip(splats, views, strict=True)]
     footprint = _pixel_footprint(views[0])
     known = torch.ones(T.shape[:2], dtype=torch.bool) if known is None else known
     return [_merge_part(splats, seen, T[:, p], known[:, p], p + 1, footprint) for p in range(T.shape[1])]

@@ -14,7 +14,7 @@ from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.geometry.similarity import inverse_similarity, view_of_moved
-from splatart_ns.rasterize.rasterization import rasterization, sh_colors
+from splatart_ns.rasterize.rasterization import rasterization, rasterize_neighbours, sh_colors
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.light import difference_in_even_light
 from splatart_ns.stages.threads import side_by_side
@@ -48,24 +48,23 @@ class PartView:
     """Number of the part's own pixels at full size."""
     factor: int
 
-    def render(self, splat: Splat, T: Tensor) -> Tensor:
-        """The splat under motions or similarities [K, 4, 4]: [K, H, W, 4], colours over black and accumulation."""
+    def render(self, splat: Splat, T: Tensor, first_order: bool = False) -> Tensor:
+        """The splat under motions or similarities [K, 4, 4]: [K, H, W, 4], colours over black and accumulation.
+
+        With `first_order`, motions are near the first, and images about its image (see `rasterize_neighbours`).
+        """
         viewmats = view_of_moved(self.viewmat, T.to(self.viewmat))
         height, width = self.weight.shape
-        image, accumulation, _ = rasterization(
-            splat.means,
-            splat.quats,
-            splat.scales,
-            splat.opacities,
-            sh_colors(splat.means, splat.sh, viewmats, splat.sh_degree),
-            viewmats,
-            self.K.expand(len(viewmats), 3, 3),
-            width,
-            height,
-            # The blur of 0.3 pixels^2 of the full image, and what averaging its pixels adds.
-            eps2d=0.3 / self.factor**2 + (1 - 1 / self.factor**2) / 12,
-        )
-        return torch.cat([image, accumulation], -1)
+        gaussians = splat.means, splat.quats, splat.scales, splat.opacities
+        colors = sh_colors(splat.means, splat.sh, viewmats, splat.sh_degree)
+        # The blur of 0.3 pixels^2 of the full image, and what averaging its pixels adds.
+        eps2d = 0.3 / self.factor**2 + (1 - 1 / self.factor**2) / 12
+        if first_order:
+            return rasterize_neighbours(*gaussians, colors, viewmats, self.K, width, height, eps2d)
+        # Accumulation is what a channel shows that is one everywhere.
+        channels = torch.cat([colors, torch.ones_like(colors[..., :1])], -1)
+        Ks = self.K.expand(len(viewmats), 3, 3)
+        return rasterization(*gaussians, channels, viewmats, Ks, width, height, eps2d=eps2d)[0]
 
     def difference(
         self,
@@ -74,22 +73,26 @@ class PartView:
         chroma_weight: float = RGB_WEIGHT,
         brightness_weight: float = RGB_WEIGHT,
         even_light: bool = False,
+        first_order: bool = False,
     ) -> Tensor:
-        """How the splat under motions [K, 4, 4] differs from the part [K, H, W, 4]."""
-        rendered = self.render(splat, T)
-        difference = rendered - self.rgba
-        brightness = difference[..., :3].mean(-1, keepdim=True)
-        chroma = difference[..., :3] - brightness
+        """How the splat under motions [K, 4, 4] differs from the part [K, H, W, 4]; see `render`."""
+        rendered = self.render(splat, T, first_order)
+        mean = torch.full((3, 3), 1 / 3).to(rendered)
+        mix = torch.eye(4).to(rendered)  # by a matrix: sums over channels take several times longer
+        mix[:3, :3] = chroma_weight * (mix[:3, :3] - mean) + (0 if even_light else brightness_weight) * mean
+        difference = (rendered - self.rgba) @ mix
         if even_light:
-            brightness = difference_in_even_light(rendered, self.rgba, self.weight)
-        difference[..., :3] = brightness_weight * brightness + chroma_weight * chroma
+            difference[..., :3] += brightness_weight * difference_in_even_light(rendered, self.rgba, self.weight)
         return difference
 
 
-def part_view(view: View, part: int, factor: int = 1, device: torch.device | None = None) -> PartView | None:
+def part_view(
+    view: View, part: int, factor: int = 1, device: torch.device | None = None, near: bool = False
+) -> PartView | None:
     """What `view` says of a part; None if it says nothing.
 
-    An unlabelled view tells only where the background is, and only if it has an alpha.
+    An unlabelled view tells only where the background is, and only if it has an alpha. Where the part is rendered
+    `near` to where the view shows it, the piece need not be wide.
     """
     if view.labels is not None:
         own, background = view.labels == part, view.labels == 0
@@ -108,7 +111,7 @@ def part_view(view: View, part: int, factor: int = 1, device: torch.device | Non
         return None
     rgba = torch.cat([view.rgb.float() / 255 * alpha[..., None], alpha[..., None]], -1)
 
-    left, top, right, bottom = _window(own if own.any() else weight > 0, factor)
+    left, top, right, bottom = _window(own if own.any() else weight > 0, factor, near)
     rgba, weight = rgba[top:bottom, left:right], weight[top:bottom, left:right]
     K = view.K.clone()
     K[0, 2] -= left
@@ -127,13 +130,13 @@ def part_view(view: View, part: int, factor: int = 1, device: torch.device | Non
     )
 
 
-def _window(shown: Tensor, factor: int) -> tuple[int, int, int, int]:
+def _window(shown: Tensor, factor: int, near: bool) -> tuple[int, int, int, int]:
     """Left, top, right, bottom of the box of `shown` [H, W] with a margin, a multiple of `factor` wide and high."""
     bounds = []
     for along, size in ((shown.any(0), shown.shape[1]), (shown.any(1), shown.shape[0])):
         inside = along.nonzero()
         low, high = int(inside.min()), int(inside.max()) + 1
-        margin = max(MARGIN, (high - low) // 2)
+        margin = max(MARGIN * factor, 0 if near else (high - low) // 2)
         low, high = max(0, low - margin), min(size, high + margin)
         bounds.append((low, low + max(1, (high - low) // factor) * factor))
     (left, right), (top, bottom) = bounds
@@ -181,22 +184,23 @@ class PartPair:
         """The part's own pixels in all views, at the size at which they are compared."""
         return sum(v.area / v.factor**2 for views in self.views for v in views)
 
-    def of_views(self, T: Tensor, measure: Callable[[Tensor, Tensor], Measure]) -> list[Measure]:
+    def of_views(
+        self, T: Tensor, measure: Callable[[Tensor, Tensor], Measure], first_order: bool = False
+    ) -> list[Measure]:
         """What `measure` says, view by view, of the differences [K, H, W, 4] under motions T [K, 4, 4] and the pixels'
         weights [H, W].
 
         First the source's Gaussians moved by T in the target's views, then the target's moved back in the source's. T
-        may be similarities.
+        may be similarities. With `first_order`, all are near the first (see `PartView.render`).
         """
+        looks_at = self.chroma_weight, self.brightness_weight, self.even_light, first_order
         ways = zip(self.splats, reversed(self.views), (T, inverse_similarity(T)), strict=True)
         looks = [(splat, view, motion) for splat, views, motion in ways for view in views]
 
         @torch.no_grad()
         def look(seen: tuple[Splat, PartView, Tensor]) -> Measure:
             splat, view, motion = seen
-            return measure(
-                view.difference(splat, motion, self.chroma_weight, self.brightness_weight, self.even_light), view.weight
-            )
+            return measure(view.difference(splat, motion, *looks_at), view.weight)
 
         return side_by_side(look, looks)
 
@@ -217,9 +221,16 @@ def huber(r: Tensor) -> Tensor:
 
 
 def part_pair(
-    splats: tuple[Splat, Splat], views: tuple[Sequence[View], Sequence[View]], part: int, num_views: int, pixels: int
+    splats: tuple[Splat, Splat],
+    views: tuple[Sequence[View], Sequence[View]],
+    part: int,
+    num_views: int,
+    pixels: int,
+    near: bool = False,
 ) -> PartPair | None:
     """Compare a part in about `num_views` views of each state, in which it covers about `pixels` pixels or fewer.
+
+    `near`: whether only motions will be tried by which it comes to within a few pixels of where the views show it.
 
     None when no labelled view of either state shows the part, or one of the states has no Gaussians of it.
     """
@@ -232,7 +243,7 @@ def part_pair(
         chosen = best_views(state_views, part, num_views)
         areas = [float((v.labels == part).sum()) for v in chosen if v.labels is not None]
         factor = max(1, int((sum(areas) / max(1, len(areas)) / pixels) ** 0.5))
-        pieces.append(tuple(p for v in chosen if (p := part_view(v, part, factor, device)) is not None))
+        pieces.append(tuple(p for v in chosen if (p := part_view(v, part, factor, device, near)) is not None))
     if not pieces[0] and not pieces[1]:
         return None
     means = parts[0].means.double()

@@ -58,7 +58,7 @@ def refine_poses(
     for p in range(P):
         refined, slides = 0, {}
         for s in range(1, S):
-            pair = part_pair((splats[0], splats[s]), (views[0], views[s]), p + 1, ALL_VIEWS, FINE_PIXELS)
+            pair = part_pair((splats[0], splats[s]), (views[0], views[s]), p + 1, ALL_VIEWS, FINE_PIXELS, near=True)
             if pair is None:
                 covariances[s, p] = torch.nan
                 continue

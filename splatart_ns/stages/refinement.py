@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -123,7 +124,9 @@ def linearized(difference: Tensor, weight: Tensor, step: float, central: bool = 
 def _normal_equations(pair: PartPair, T: Tensor, n: int, central: bool = False) -> NormalEquations:
     steps = trial_steps(n, central, T)
     motions = increment(T.expand(len(steps), 4, 4), steps, pair.centroid, pair.radius)
-    H, gradients, costs = zip(*pair.of_views(motions, lambda d, w: linearized(d, w, STEP, central)), strict=True)
+    H, gradients, costs = zip(
+        *pair.of_views(motions, partial(linearized, step=STEP, central=central), True), strict=True
+    )
     return NormalEquations(torch.stack(H), torch.stack(gradients), sum(costs) / max(pair.area, 1.0))
 
 

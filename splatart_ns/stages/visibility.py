@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -26,19 +27,20 @@ def visibility(splat: Splat, views: Sequence[View]) -> Tensor:
 
     The mean over all views.
     """
-    views = views[:: -(-len(views) // MAX_VIEWS)]
-    return sum(side_by_side(lambda view: _contribution(splat, view)[0], views)) / len(views)
+    return looked_at(splat, views)[0]
 
 
 def clearest(splat: Splat, views: Sequence[View]) -> Tensor:
     """The share of each Gaussian [N] that the view shows which shows it best: 1 if nothing is before it there."""
+    return looked_at(splat, views)[1]
+
+
+def looked_at(splat: Splat, views: Sequence[View]) -> tuple[Tensor, Tensor]:
+    """`visibility` and `clearest` at the price of one."""
     views = views[:: -(-len(views) // MAX_VIEWS)]
-
-    def share(view: View) -> Tensor:
-        contribution, alone = _contribution(splat, view)
-        return torch.where(alone > 0, contribution / alone.clamp_min(1e-6), 0.0)
-
-    return torch.stack(side_by_side(share, views)).amax(0)
+    contributions, alone = map(torch.stack, zip(*side_by_side(partial(_contribution, splat), views), strict=True))
+    share = torch.where(alone > 0, contributions / alone.clamp_min(1e-6), 0.0)
+    return contributions.mean(0), share.amax(0)
 
 
 def _contribution(splat: Splat, view: View) -> tuple[Tensor, Tensor]:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -130,3 +132,24 @@ def test_points_that_cannot_be_read_are_an_input_error(tmp_path, data):
         (tmp_path / "p.ply").write_bytes(data)
     with pytest.raises(InputError, match=r"p\.ply"):
         load_points(tmp_path / "p.ply", Normalization(np.zeros(3), 1.0))
+
+
+def test_the_piece_around_the_object_is_seen_by_a_camera_of_its_own(capture_folder):
+    view = load_views(load_capture(capture_folder), 0)[0]
+    big = replace(view, width=200, height=160, rgb=torch.zeros(160, 200, 3, dtype=torch.uint8), labels=None)
+    big.alpha = torch.zeros(160, 200, dtype=torch.uint8)
+    big.alpha[70:90, 100:120] = 1
+    assert (window := big.object_window()) == (80, 48, 136, 112)  # 16 pixels around, then multiples of 8
+    piece = big.cropped(window)
+    assert (piece.width, piece.height) == (56, 64) and piece.alpha.shape == (64, 56) and piece.rgb.shape == (64, 56, 3)
+    assert piece.alpha.sum() == big.alpha.sum()
+    assert (big.K - piece.K)[:2, 2].tolist() == [80, 48] and torch.equal(piece.viewmat, big.viewmat)
+    big.alpha[159, 199] = 255
+    assert big.object_window() == (80, 48, 200, 160)
+
+
+@pytest.mark.parametrize("alpha", [None, 0])
+def test_where_no_image_says_where_the_object_is_the_piece_is_all(capture_folder, alpha):
+    view = load_views(load_capture(capture_folder), 0)[0]
+    view.alpha = None if alpha is None else torch.zeros_like(view.alpha)
+    assert view.object_window() == (0, 0, 16, 16)

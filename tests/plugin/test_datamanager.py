@@ -1,11 +1,13 @@
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from splatart_ns.capture.formats import load_capture
+from splatart_ns.capture.view import View
 from splatart_ns.plugin.datamanager import SplatartDatamanager, SplatartDatamanagerConfig
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.stages.hull import carve
@@ -86,3 +88,36 @@ def test_images_can_be_kept_on_the_cpu_of_a_machine_without_accelerator(capture_
     assert manager.next_train(0)[1]["image"].dtype == torch.uint8
     (camera, batch), *rest = manager.fixed_indices_eval_dataloader
     assert len(rest) == 2 and batch["image"].shape == (64, 64, 4) and camera.width.item() == 64
+
+
+def test_training_sees_the_piece_of_a_frame_that_shows_the_object(capture_dir: Path) -> None:
+    manager = manage(capture_dir)
+    cached, views = manager.cached_train, manager.train_dataset.views
+    views[:] = [framed(view, 64) for view in views]
+    cached[:] = [manager.train_dataset.get_data(i) for i in range(len(views))]
+    manager.train_cameras.width[:] = manager.train_cameras.height[:] = 192
+    manager.train_cameras.cx += 64
+    manager.train_cameras.cy += 64
+    for step in range(len(views)):
+        camera, batch = manager.next_train(step)
+        view = views[batch["image_idx"]]
+        left, top, right, bottom = view.object_window()
+        assert (int(camera.width), int(camera.height)) == (right - left, bottom - top) != (192, 192)
+        assert camera.metadata["whole"] == (192, 192)
+        assert batch["share"] == (right - left) * (bottom - top) / 192**2
+        assert batch["image"].shape == (bottom - top, right - left, 4)
+        assert batch["semantics"].shape == (bottom - top, right - left, 1)
+        assert batch["image"][..., 3].sum() * 255 == pytest.approx(float(view.alpha.sum()))
+        assert [float(camera.cx) + left, float(camera.cy) + top] == pytest.approx(view.K[:2, 2].tolist())
+    assert manager.train_cameras.width.unique().tolist() == [192]
+
+
+def framed(view: View, border: int) -> View:
+    """The view with nothing around it."""
+    pixels = {name: getattr(view, name) for name in ("rgb", "alpha", "labels")}
+    padded = {
+        name: None if x is None else torch.nn.functional.pad(x, (*[0] * 2 * (x.ndim - 2), *[border] * 4))
+        for name, x in pixels.items()
+    }
+    K = view.K + border * torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 0]])
+    return replace(view, K=K, width=view.width + 2 * border, height=view.height + 2 * border, **padded)

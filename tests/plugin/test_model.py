@@ -162,6 +162,36 @@ def test_gaussians_do_not_grow_beyond_their_number(semantic_trainer, capture_dir
     assert (need > model.strategy.grow_grad2d).sum() == 0
 
 
+def test_gaussians_grow_in_proportion_to_the_points_they_started_from(semantic_trainer, capture_dir: Path) -> None:
+    trainer = semantic_trainer(capture_dir)
+    model = trainer.pipeline.model
+    started = model.num_points
+    model.strategy_state.update(grad2d=torch.arange(1.0, started + 1), count=torch.ones(started))
+    model.config.max_gaussians = 10**6
+    model._limit_growth()
+    grow = (model.strategy_state["grad2d"] > model.strategy.grow_grad2d).sum()
+    assert grow == started // 2
+
+
+def test_the_strategy_and_the_metrics_measure_pieces_as_shares_of_the_image(semantic_trainer, capture_dir: Path):
+    trainer = semantic_trainer(capture_dir)
+    model, manager = trainer.pipeline.model, trainer.pipeline.datamanager
+    iterate(trainer, 0)
+    camera, batch = manager.next_train(0)
+    camera.metadata["whole"] = (10 * int(camera.width), 10 * int(camera.height))
+    outputs = model(camera)
+    factor = model._get_downscale_factor()
+    assert (model.info["width"], model.info["height"]) == tuple(
+        10 * int(x) // factor for x in (camera.width, camera.height)
+    )
+    whole, piece = ({"share": share, **{k: v for k, v in batch.items() if k != "share"}} for share in (1.0, 0.01))
+    psnr = [float(model.get_metrics_dict(outputs, data)["psnr"]) for data in (whole, piece)]
+    assert psnr[1] - psnr[0] == pytest.approx(20, abs=1e-3)
+    losses = [model.get_loss_dict(outputs, data) for data in (whole, piece)]
+    for name in ("main_loss", "accumulation"):
+        assert float(losses[1][name]) == pytest.approx(0.01 * float(losses[0][name]))
+
+
 def test_colours_of_parts_differ() -> None:
     colours = part_colours(12)
     assert colours.shape == (13, 3) and torch.equal(colours[0], torch.zeros(3))

@@ -59,7 +59,7 @@ def pose_trainer(capture_dir, semantic_runs, tmp_path):
 def test_poses_start_at_centroids(pose_trainer):
     T = pose_trainer(init="centroids").pipeline.model.poses.T().detach()
     assert torch.equal(T[..., :3, :3], torch.eye(3).double().expand(2, 2, 3, 3))
-    assert T[1, 1, :3, 3].norm() > 0.05 > T[1, 0, :3, 3].norm()
+    assert T[1, 1, :3, 3].norm() > 0.2 and T[1, 0, :3, 3].norm() < 0.1
 
 
 def test_poses_start_from_a_file_in_the_captures_unit(pose_trainer, capture_dir, tmp_path):
@@ -75,9 +75,10 @@ def test_poses_start_from_a_file_in_the_captures_unit(pose_trainer, capture_dir,
 
 def test_gaussians_that_no_view_shows_are_left_out(pose_trainer, monkeypatch):
     def last_seen(splat, views):
-        return (torch.arange(len(splat)) == len(splat) - 1).float()
+        seen = (torch.arange(len(splat)) == len(splat) - 1).float()
+        return seen, seen
 
-    monkeypatch.setattr("splatart_ns.plugin.pose.clearest", last_seen)
+    monkeypatch.setattr("splatart_ns.plugin.pose.looked_at", last_seen)
     model = pose_trainer(init="centroids").pipeline.model
     assert [len(model.state_splat(state)) for state in (0, 1)] == [1, 1]
 

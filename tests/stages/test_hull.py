@@ -5,7 +5,16 @@ from part_scene import box, photograph
 
 from splatart_ns.geometry.se3 import se3_exp
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.hull import MIN_POINTS_PER_PART, carve, seed_points, slack, visual_hull, vote_by_projection
+from splatart_ns.stages.hull import (
+    MIN_POINTS_PER_PART,
+    POINTS_PER_PART,
+    POINTS_PER_PIXEL,
+    carve,
+    seed_points,
+    slack,
+    visual_hull,
+    vote_by_projection,
+)
 
 SIZE = (0.9, 0.6, 0.3)
 BASE, KNOB = box(1, SIZE, (0.0, 0.0, -0.1)), box(2, (0.16, 0.16, 0.16), (0.0, 0.0, 0.3), spacing=0.04)
@@ -53,8 +62,24 @@ def test_points_take_the_label_that_most_views_show():
 
 
 def test_a_small_part_gets_its_least_number_of_points():
-    labels = vote_by_projection(VIEWS, seeds().xyz, 2)
-    assert (labels == 2).sum() > 0.8 * MIN_POINTS_PER_PART[2]
+    labels = vote_by_projection(VIEWS, seeds().xyz, 2)  # of 500 points, 250 each: it has a fortieth of the volume
+    assert (labels == 2).sum() > 0.8 * 250
+    fine = photograph(Splat.cat([BASE, KNOB]), count=6, pixels=240)
+    points = seed_points(fine, 2, 4000, torch.Generator().manual_seed(0), visual_hull(fine, resolution=40))
+    labels = vote_by_projection(fine, points.xyz, 2)
+    assert 0.8 * MIN_POINTS_PER_PART[2] < (labels == 2).sum() < 1.5 * MIN_POINTS_PER_PART[2]
+
+
+def test_small_silhouettes_get_fewer_points():
+    pixels = sum(float((view.alpha > 127).sum()) for view in VIEWS) / len(VIEWS)
+    hull = visual_hull(VIEWS, resolution=40)
+    points = [seed_points(VIEWS, 2, n, torch.Generator().manual_seed(0), hull) for n in (20000, 40000)]
+    assert len(points[0].xyz) == len(points[1].xyz)
+    enough = POINTS_PER_PIXEL * pixels + POINTS_PER_PART * 2
+    assert enough - 1 < len(points[0].xyz) < 2 * enough  # and the small part's
+    far = photograph(Splat.cat([BASE, KNOB]), count=14, pixels=24)
+    less = seed_points(far, 2, 20000, torch.Generator().manual_seed(0), hull)
+    assert len(less.xyz) < 0.7 * len(points[0].xyz)
 
 
 def test_points_have_the_colours_of_the_images_and_repeat_by_seed():

@@ -52,6 +52,14 @@ def test_a_smaller_piece_shows_the_same(scene):
         assert (image - piece.rgba)[inside].abs().mean() < 0.02, factor
 
 
+def test_a_narrow_piece_is_a_piece_of_the_wide_one(scene):
+    wide, narrow = (part_view(scene[1][0][0], 2, near=near) for near in (False, True))
+    left, top = (round(float(x)) for x in (wide.K - narrow.K)[:2, 2])
+    height, width = narrow.weight.shape
+    assert narrow.weight.numel() < 0.8 * wide.weight.numel() and narrow.area == wide.area
+    assert torch.equal(narrow.rgba, wide.rgba[top:, left:][:height, :width])
+
+
 def test_the_right_motion_costs_least(scene):
     splats, views = scene
     truth = motion((0, 0, 25), (0.3, 0.0, 0.0))
