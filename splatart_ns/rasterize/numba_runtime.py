@@ -57,7 +57,7 @@ def run(kernel: Callable, bounds: np.ndarray, *args) -> list:
 
 def even_bounds(count: int, workers: int) -> np.ndarray:
     """Bounds [workers + 1] of intervals that share `count` items evenly."""
-    return np.linspace(0, count, workers + 1).astype(np.int64)
+    return np.array([i * count // workers for i in range(workers + 1)])
 
 
 def balanced_bounds(offsets: np.ndarray, workers: int) -> np.ndarray:
