@@ -53,9 +53,9 @@ def refine(
     """Levenberg-Marquardt from T [4, 4] on all pixels of the pair, robust by Huber weights.
 
     `hold_rotation` moves only the translation, `with_scale` lets T become a similarity. `central` takes differences to
-    both sides, at nearly twice the renderings: where a backend renders every image (see `rasterize_neighbours`), those to
-    one side err by half a step times how the residuals bend, which ends the search too early where the residuals are
-    large, as they are when cameras are not exact.
+    both sides, at nearly twice the renderings: where every image is rendered (see `rasterize_neighbours`), those to one
+    side err by half a step times how the residuals bend, which ends the search too early where the residuals are large,
+    as they are when cameras are not exact.
     """
     T = T.double()
     n = 3 if hold_rotation else 7 if with_scale else 6
