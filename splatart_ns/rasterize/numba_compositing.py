@@ -149,8 +149,8 @@ def composite_neighbours(begin, end, worker, bins, means, conics, colors, visibl
     """
     tiles_x, tile_offsets, gaussians, coefficients = bins.tiles_x, bins.tile_offsets, bins.gaussians, bins.coefficients
     cameras, height, width = images.shape[0], images.shape[1], images.shape[2]
-    work = _aligned(8 * PIXELS)
-    rates, right, down = work[5 * PIXELS :], work[6 * PIXELS :], work[7 * PIXELS :]
+    work = _aligned(7 * PIXELS)
+    right, down = work[5 * PIXELS :], work[6 * PIXELS :]
     planes = _aligned(cameras * 4 * PIXELS).reshape((cameras, 4 * PIXELS))
     first = planes[0]
     for tile in range(begin, end):
@@ -167,8 +167,7 @@ def composite_neighbours(begin, end, worker, bins, means, conics, colors, visibl
             for p in range(PIXELS):
                 dy = work[_Y + p] + y0
                 u = work[_X + p] + (shear * work[_Y + p] + u0)
-                log2_alpha = square * u * u + (drop * dy * dy + peak)
-                alpha = _alpha(log2_alpha)
+                alpha = _alpha(square * u * u + (drop * dy * dy + peak))
                 t = work[_T + p]
                 weight = alpha * t
                 rest = t - weight
@@ -177,7 +176,6 @@ def composite_neighbours(begin, end, worker, bins, means, conics, colors, visibl
                 work[_T + p] = rest if alive else -abs(t)
                 work[_W + p] = weight
                 work[_A + p] = alpha if alive else _ZERO
-                rates[p] = _ZERO if log2_alpha > _LOG2_ALPHA_MAX else weight
                 right[p] = work[_X + p] + x0
                 down[p] = dy
                 first[p] += weight * c0
@@ -197,7 +195,7 @@ def composite_neighbours(begin, end, worker, bins, means, conics, colors, visibl
                     dx, dy, weight = right[p], down[p], work[_W + p]
                     t = plane[3 * PIXELS + p]
                     s = dx * (sx + sxx * dx + sxy * dy) + dy * (sy + syy * dy)
-                    v = rates[p] * s + work[_A + p] * t
+                    v = weight * s + work[_A + p] * t
                     plane[3 * PIXELS + p] = t - v
                     plane[p] += v * c0 + weight * v0
                     plane[PIXELS + p] += v * c1 + weight * v1

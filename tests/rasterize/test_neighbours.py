@@ -15,7 +15,7 @@ def scene_near(step: float, opacity: float = 1.0, **settings):
     """A float32 scene, and what `rasterize_neighbours` takes: its camera, and six that moved by `step` each."""
     scene = world_scene(**settings)
     viewmats = torch.cat([torch.eye(4)[None].double(), se3_exp(step * TANGENTS)]) @ scene["viewmats"]
-    near = dict(scene, colors=scene["colors"].expand(7, -1, -1), opacities=opacity * scene["opacities"])
+    near = dict(scene, colors=scene["colors"].expand(7, -1, -1), opacities=(opacity * scene["opacities"]).clamp(max=1))
     near |= dict(viewmats=viewmats, K=near.pop("Ks")[0])
     return {k: v.float() if torch.is_tensor(v) else v for k, v in near.items()}
 
@@ -31,7 +31,7 @@ def test_the_first_image_is_that_of_the_rasterizer():
     assert torch.equal(rasterize_neighbours(**near, backend="numba")[0], all_images(near)[0])
 
 
-@pytest.mark.parametrize("opacity", [0.05, 1.0])
+@pytest.mark.parametrize("opacity", [0.05, 1.0, 1e6])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_others_differ_by_the_rasterizers_derivative(seed, opacity):
     near = scene_near(1e-3, opacity, N=200, seed=seed)
@@ -44,7 +44,7 @@ def test_the_others_differ_by_the_rasterizers_derivative(seed, opacity):
     slope = torch.autograd.grad((weights * image).sum(), viewmat)[0]
     expected = ((near["viewmats"][1:] - near["viewmats"][:1]).double() * slope).sum((1, 2))
     found = ((images[1:] - images[:1]).double() * weights[0]).sum((1, 2, 3))
-    assert (found - expected).norm() < 0.01 * expected.norm()
+    assert (found - expected).norm() < 3e-3 * expected.norm()
 
 
 def test_colours_may_differ_too():
