@@ -31,7 +31,7 @@ SLIDES = 6
 SLIDE_STEP, SLIDE_STEPS = 0.3, 5
 """The grid's step in part radii, and how many of them it reaches to each side."""
 NEARLY = 0.5
-"""A step may take a point that is this much farther than the nearest: a third less time, and the same candidates."""
+"""A step may take a point that is half as far again as the nearest: a third less time, and the same candidates."""
 COLOUR = 0.3
 """Colour difference (0 to 1) of one counts as this many part radii."""
 
