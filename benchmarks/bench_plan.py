@@ -201,7 +201,8 @@ def growths(extent: Extent, seeds: int) -> list[Point]:
             for size in sizes:
                 source, flags, gaussians = "random-102-2", (*few, "128"), 4000
                 if what == "Gaussians":
-                    flags, gaussians = (*few, "256"), size
+                    # Fewer pixels would not have as many Gaussians.
+                    flags, gaussians = (*few, "1024"), size
                 elif what == "pixels a side":
                     flags = (*few, str(size))
                 elif what == "parts":

@@ -80,7 +80,7 @@ def write_report(
         text += ["![Stages](images/bench_stages.png)\n", stage_table(trades)]
     text += [profile_section(r) for r in done if "profile" in r]
     sizes = [(r["group"], r["size"]) for r in done if r["size"] is not None]
-    grown = [r for r in done if len({size for group, size in sizes if group == r["group"]}) > 1]
+    grown = [r for r in done if r["size"] is not None and len({s for group, s in sizes if group == r["group"]}) > 1]
     if grown:
         growth_figure(grown, docs / "images" / "bench_growth.png")
         text += [GROWTH, growth_table(grown), "![Growth](images/bench_growth.png)\n"]
