@@ -172,3 +172,11 @@ def test_the_profiler_accounts_for_all_seconds_by_the_innermost_known_file():
 
 def test_a_scene_that_is_there_is_not_made():
     assert not Scene("mine", "/captures/mine").made and Scene("object 2", "random-102-2").made
+
+
+def test_what_is_a_setting_and_also_grows_is_plotted_by_its_sizes_alone(tmp_path):
+    settings = [p for p in trade_offs(replace(QUICK, parts=(2,)), []) if p.group == "Gaussians"]
+    sizes = [p for p in growths(QUICK, 1) if p.group == "Gaussians"]
+    plan = [*settings, *sizes]
+    document = written(tmp_path, plan, [record(p, 10.0 + (p.size or 0) / 1e4, 1.0) for p in plan])
+    assert f"| Gaussians | {min(p.size for p in sizes)} to {max(p.size for p in sizes)} | all |" in document
