@@ -74,13 +74,10 @@ class View:
         shown = None if self.alpha is None else self.alpha > 0
         if shown is None or not shown.any():
             return 0, 0, self.width, self.height
-        bounds = []
-        for along, size in ((shown.any(0), self.width), (shown.any(1), self.height)):
-            inside = along.nonzero()
-            low, high = int(inside.min()) - MARGIN, int(inside.max()) + 1 + MARGIN
-            bounds.append((max(0, low // GRAIN * GRAIN), min(size, -(-high // GRAIN) * GRAIN)))
-        (left, right), (top, bottom) = bounds
-        return left, top, right, bottom
+        left, top, right, bottom = box(shown)
+        low = (max(0, (x - MARGIN) // GRAIN * GRAIN) for x in (left, top))
+        high = (min(n, -(-(x + MARGIN) // GRAIN) * GRAIN) for x, n in ((right, self.width), (bottom, self.height)))
+        return *low, *high
 
     def cropped(self, window: Window) -> View:
         """The piece of the view in a window."""
@@ -92,6 +89,12 @@ class View:
         rgb, alpha, labels, mask = (None if x is None else x[top:bottom, left:right] for x in pixels)
         size = {"width": right - left, "height": bottom - top}
         return replace(self, K=K, rgb=rgb, alpha=alpha, labels=labels, mask=mask, **size)
+
+
+def box(shown: Tensor) -> Window:
+    """The smallest piece of an image that holds all that is `shown` [H, W] bool, which is something."""
+    columns, rows = (shown.any(dim).nonzero() for dim in (0, 1))
+    return int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1
 
 
 def load_views(capture: Capture, state: int | State, split: str = "train", downscale: int = 1) -> list[View]:

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from splatart_ns.capture.capture import UNLABELLED
-from splatart_ns.capture.view import View
+from splatart_ns.capture.view import View, Window, box
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.geometry.similarity import inverse_similarity, view_of_moved
 from splatart_ns.rasterize.rasterization import rasterization, rasterize_neighbours, sh_colors
@@ -130,12 +130,11 @@ def part_view(
     )
 
 
-def _window(shown: Tensor, factor: int, near: bool) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of the box of `shown` [H, W] with a margin, a multiple of `factor` wide and high."""
+def _window(shown: Tensor, factor: int, near: bool) -> Window:
+    """The box of `shown` [H, W] with a margin, a multiple of `factor` wide and high."""
+    left, top, right, bottom = box(shown)
     bounds = []
-    for along, size in ((shown.any(0), shown.shape[1]), (shown.any(1), shown.shape[0])):
-        inside = along.nonzero()
-        low, high = int(inside.min()), int(inside.max()) + 1
+    for low, high, size in ((left, right, shown.shape[1]), (top, bottom, shown.shape[0])):
         margin = max(MARGIN * factor, 0 if near else (high - low) // 2)
         low, high = max(0, low - margin), min(size, high + margin)
         bounds.append((low, low + max(1, (high - low) // factor) * factor))

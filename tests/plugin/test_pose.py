@@ -165,3 +165,21 @@ def test_a_part_that_may_have_turned_unseen_is_noted(pose_trainer):
 def test_a_run_that_would_never_merge_is_refused(pose_trainer):
     with pytest.raises(InputError, match="max-num-iterations"):
         pose_trainer(steps=4, pose_steps=4, init="centroids")
+
+
+def test_merged_gaussians_learn_from_the_pieces_that_show_the_object(pose_trainer):
+    pipeline = pose_trainer(init="centroids").pipeline
+    views = [view for of_state in pipeline.views for view in of_state]
+    for view in views:  # a corner of the object is all that is left of it
+        view.alpha = view.alpha.clone()
+        view.alpha[24:] = view.alpha[:, 24:] = 0
+        view.alpha[0, 0] = 255
+    own = pipeline._shuffled_views()
+    for state, piece, share in (next(own) for _ in views):
+        whole = next(view for view in pipeline.views[state] if view.name == piece.name)
+        assert piece.alpha.sum() == whole.alpha.sum()
+        assert share == piece.width * piece.height / (whole.width * whole.height) < 1
+    pipeline._own = iter([(state, piece, share), (state, piece, 0.5 * share)])
+    pipeline.model.merged.fill_(True)
+    first, second = (sum(pipeline.get_train_loss_dict(step)[1].values()) for step in (0, 0))
+    assert float(second) < 0.9 * float(first)
