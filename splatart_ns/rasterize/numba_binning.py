@@ -13,6 +13,9 @@ TILE = 8
 """Side of a tile, pixels."""
 PIXELS = TILE * TILE
 
+BAND_ROWS = 2
+"""Rows of a tile in a band, the least that compositing leaves out: a vector register of pixels at its widest."""
+
 _LOG2_E = math.log2(math.e)
 # The exponent's float32 rounding may put a pixel just inside the support: look a little further than the exact ellipse.
 _MARGIN = 1e-4
@@ -30,6 +33,8 @@ class Bins(NamedTuple):
     """[C tiles_y tiles_x + 1]: where the pairs of each tile start, front to back."""
     gaussians: np.ndarray
     """[E] Gaussian of each pair."""
+    bands: np.ndarray
+    """[E] Which bands of the tile it may touch: 16 times the first, and one past the last."""
     pairs: np.ndarray
     """[E] pair of each slot."""
     order: np.ndarray
@@ -42,7 +47,7 @@ class Bins(NamedTuple):
 
 @jit
 def _extents(begin, end, worker, means, conics, opacities, visible, width, height, coefficients, ellipses, rows):
-    """Fills the coefficients, ellipses [G, 2] (half width in x, squared radius) and rows [G, 2] (first, one past last).
+    """Fills coefficients, ellipses [G, 3] (half extents in x, y; squared radius), rows [G, 2] (first, one past last).
 
     All in float64: the rest of a needle's conic is a small difference.
     """
@@ -68,7 +73,8 @@ def _extents(begin, end, worker, means, conics, opacities, visible, width, heigh
         rows[g, 0] = first
         rows[g, 1] = last + 1
         ellipses[g, 0] = half_x
-        ellipses[g, 1] = radius2
+        ellipses[g, 1] = half_y
+        ellipses[g, 2] = radius2
         coefficients[g, 0] = x
         coefficients[g, 1] = y
         coefficients[g, 2] = -0.5 * _LOG2_E * a
@@ -131,8 +137,7 @@ def _spans(begin, end, worker, order, row_offsets, means, conics, ellipses, rows
         x, y = np.float64(means[g, 0]), np.float64(means[g, 1])
         a, b, c = np.float64(conics[g, 0]), np.float64(conics[g, 1]), np.float64(conics[g, 2])
         det = max(a * c - b * b, 1e-12 * a * c)
-        half_x, radius2 = ellipses[g, 0], ellipses[g, 1]
-        half_y = math.sqrt(radius2 * a / det)
+        half_x, half_y, radius2 = ellipses[g, 0], ellipses[g, 1], ellipses[g, 2]
         tip = b / c * half_x  # minus the height at which the ellipse reaches furthest right
         count = 0
         for row in range(rows[g, 0], rows[g, 1]):
@@ -179,18 +184,24 @@ def _offsets(tallies, sizes):
 
 
 @jit
-def _fill(begin, end, worker, order, row_offsets, rows, spans, slot_offsets, grid, places, gaussians, pairs):
+def _fill(begin, end, worker, order, row_offsets, means, ellipses, rows, spans, slot_offsets, grid, places, lists):
     """Lists the pairs by tile."""
     tiles_x, tiles_y, per_camera = grid
+    gaussians, bands, pairs = lists
     place = places[worker]
     i = row_offsets[begin]
     for k in range(begin, end):
         g = order[k]
         slot = slot_offsets[k]
+        top, bottom = means[g, 1] - ellipses[g, 1] - 0.5, means[g, 1] + ellipses[g, 1] - 0.5
         for row in range(rows[g, 0], rows[g, 1]):
             base = ((g // per_camera) * tiles_y + row) * tiles_x
+            first = math.ceil(max(top - row * TILE, 0.0))
+            last = math.floor(max(min(bottom - row * TILE, TILE - 1.0), -1.0))
+            band = np.uint8(16 * (first // BAND_ROWS) + last // BAND_ROWS + 1)
             for tile in range(base + spans[i, 0], base + spans[i, 1]):
                 gaussians[place[tile]] = g
+                bands[place[tile]] = band
                 pairs[slot] = place[tile]
                 place[tile] += 1
                 slot += 1
@@ -208,7 +219,7 @@ def bin_gaussians(means, conics, opacities, depths, visible, cameras: int, width
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     workers = num_workers()
     coefficients = np.empty((total, 6))
-    ellipses = np.empty((total, 2))
+    ellipses = np.empty((total, 3))
     rows = np.empty((total, 2), np.int32)
     bounds = even_bounds(total, workers)
     run(_extents, bounds, means, conics, opacities, visible, width, height, coefficients, ellipses, rows)
@@ -222,6 +233,8 @@ def bin_gaussians(means, conics, opacities, depths, visible, cameras: int, width
     run(_spans, bounds, order, row_offsets, means, conics, ellipses, rows, size, grid, spans, tallies, sizes)
     tile_offsets, slot_offsets = _offsets(tallies, sizes)
     gaussians = np.empty(tile_offsets[-1], np.int32)
+    bands = np.empty(tile_offsets[-1], np.uint8)
     pairs = np.empty(tile_offsets[-1], np.int32)
-    run(_fill, bounds, order, row_offsets, rows, spans, slot_offsets, grid, tallies, gaussians, pairs)
-    return Bins(tiles_x, tiles_y, tile_offsets, gaussians, pairs, order, slot_offsets, coefficients)
+    lists = gaussians, bands, pairs
+    run(_fill, bounds, order, row_offsets, means, ellipses, rows, spans, slot_offsets, grid, tallies, lists)
+    return Bins(tiles_x, tiles_y, tile_offsets, gaussians, bands, pairs, order, slot_offsets, coefficients)

@@ -1,8 +1,9 @@
 """Compositing of the pairs of each tile, front to back, and its gradient, back to front.
 
 A tile's 64 pixels lie side by side in one small workspace, at fixed offsets, so that every inner loop runs over them in
-vector registers: LLVM vectorises them only where it sees that nothing overlaps. The first four channels of colour
-share the loops of the geometry; each further group of four has one loop of its own.
+vector registers: LLVM vectorises them only where it sees that nothing overlaps and that no index is negative. The loops
+leave out the bands of rows that a Gaussian does not reach, a third of all. The first four channels of colour share the
+loops of the geometry; each further group of four has one loop of its own.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import math
 
 import numpy as np
 
-from splatart_ns.rasterize.numba_binning import PIXELS, TILE
+from splatart_ns.rasterize.numba_binning import BAND_ROWS, PIXELS, TILE
 from splatart_ns.rasterize.numba_runtime import jit
 
 GROUP = 4
@@ -26,8 +27,9 @@ _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _E0, _E1, _E2 = np.float32(0.9999999250636943), np.float32(0.6931530731907609), np.float32(0.24015361712565741)
 _E3, _E4, _E5 = np.float32(0.05582631781272315), np.float32(0.00898934037714072), np.float32(0.0018775765567582148)
 
-# Offsets in the workspace of a tile; the channels' planes come last.
-_X, _Y, _T, _W, _A, _COLOR = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIXELS, 5 * PIXELS
+# Offsets in the workspace of a tile: the pixels' coordinates, transmittance, weight and alpha of a pair, and two planes
+# for what a kernel needs besides; the channels' planes come last.
+_X, _Y, _T, _W, _A, _B, _V, _COLOR = (i * PIXELS for i in range(8))
 
 
 @jit
@@ -50,6 +52,12 @@ def _at_tile(coefficients, left, top):
     x, y, f, s, h, k = coefficients
     u0 = (left - x) + s * (top - y)
     return np.float32(u0), np.float32(top - y), np.float32(f), np.float32(s), np.float32(h), np.float32(k)
+
+
+@jit
+def _touched(bands):
+    """The first pixel of a tile, and one past the last, of a pair's `Bins.bands`."""
+    return BAND_ROWS * TILE * np.int64(bands >> 4), BAND_ROWS * TILE * np.int64(bands & 15)
 
 
 @jit
@@ -86,34 +94,36 @@ def composite(begin, end, worker, bins, colors, render, alphas, depths):
         row, column = (tile // tiles_x) % tiles_y, tile % tiles_x
         left, top = column * TILE + 0.5, row * TILE + 0.5
         _start_tile(work)
-        work[_A:] = _ZERO
+        work[_B:] = _ZERO
         pair = tile_offsets[tile]
         while pair < tile_offsets[tile + 1]:
             g = gaussians[pair]
             u0, y0, square, shear, drop, peak = _at_tile(coefficients[g], left, top)
+            first, past = _touched(bins.bands[pair])
             c0, c1, c2, c3 = colors[g, 0], colors[g, 1], colors[g, 2], colors[g, 3]
-            for p in range(PIXELS):
-                dy = work[_Y + p] + y0
-                u = work[_X + p] + (shear * work[_Y + p] + u0)
+            band = work[first:]
+            for p in range(past - first):
+                dy = band[_Y + p] + y0
+                u = band[_X + p] + (shear * band[_Y + p] + u0)
                 alpha = _alpha(square * u * u + (drop * dy * dy + peak))
-                t = work[_T + p]
+                t = band[_T + p]
                 weight = alpha * t
                 rest = t - weight
                 # The sign marks saturated pixels, which keep their transmittance.
                 alive = rest > _T_MIN
                 weight = weight if alive else _ZERO
-                work[_T + p] = rest if alive else -abs(t)
-                work[_W + p] = weight
-                work[_A + p] += weight
-                work[_COLOR + p] += weight * c0
-                work[_COLOR + PIXELS + p] += weight * c1
-                work[_COLOR + 2 * PIXELS + p] += weight * c2
-                work[_COLOR + 3 * PIXELS + p] += weight * c3
+                band[_T + p] = rest if alive else -abs(t)
+                band[_W + p] = weight
+                band[_B + p] += weight
+                band[_COLOR + p] += weight * c0
+                band[_COLOR + PIXELS + p] += weight * c1
+                band[_COLOR + 2 * PIXELS + p] += weight * c2
+                band[_COLOR + 3 * PIXELS + p] += weight * c3
             for i in range(1, groups.shape[0]):
-                d, group = GROUP * i, groups[i]
+                d, group = GROUP * i, groups[i, first:]
                 c0, c1, c2, c3 = colors[g, d], colors[g, d + 1], colors[g, d + 2], colors[g, d + 3]
-                for p in range(PIXELS):
-                    weight = work[_W + p]
+                for p in range(past - first):
+                    weight = band[_W + p]
                     group[p] += weight * c0
                     group[PIXELS + p] += weight * c1
                     group[2 * PIXELS + p] += weight * c2
@@ -135,7 +145,7 @@ def composite(begin, end, worker, bins, colors, render, alphas, depths):
                 for j in range(wide):
                     target[j, d] = plane[j]
             for j in range(wide):
-                alphas[camera, row * TILE + i, column * TILE + j, 0] = work[_A + i * TILE + j]
+                alphas[camera, row * TILE + i, column * TILE + j, 0] = work[_B + i * TILE + j]
 
 
 @jit
@@ -149,53 +159,55 @@ def composite_neighbours(begin, end, worker, bins, means, conics, colors, visibl
     """
     tiles_x, tile_offsets, gaussians, coefficients = bins.tiles_x, bins.tile_offsets, bins.gaussians, bins.coefficients
     cameras, height, width = images.shape[0], images.shape[1], images.shape[2]
-    work = _aligned(7 * PIXELS)
-    right, down = work[5 * PIXELS :], work[6 * PIXELS :]
+    work = _aligned(_COLOR + 4 * PIXELS)
+    seen = work[_COLOR:]
     planes = _aligned(cameras * 4 * PIXELS).reshape((cameras, 4 * PIXELS))
-    first = planes[0]
     for tile in range(begin, end):
         row, column = tile // tiles_x, tile % tiles_x
         left, top = column * TILE + 0.5, row * TILE + 0.5
         _start_tile(work)
+        seen[:] = _ZERO
         planes[:] = _ZERO
         pair = tile_offsets[tile]
         while pair < tile_offsets[tile + 1]:
             g = gaussians[pair]
             u0, y0, square, shear, drop, peak = _at_tile(coefficients[g], left, top)
+            first, past = _touched(bins.bands[pair])
             x0 = np.float32(left - means[0, g, 0])
             c0, c1, c2 = colors[0, g, 0], colors[0, g, 1], colors[0, g, 2]
-            for p in range(PIXELS):
-                dy = work[_Y + p] + y0
-                u = work[_X + p] + (shear * work[_Y + p] + u0)
+            band = work[first:]
+            for p in range(past - first):
+                dy = band[_Y + p] + y0
+                u = band[_X + p] + (shear * band[_Y + p] + u0)
                 alpha = _alpha(square * u * u + (drop * dy * dy + peak))
-                t = work[_T + p]
+                t = band[_T + p]
                 weight = alpha * t
                 rest = t - weight
                 alive = rest > _T_MIN
                 weight = weight if alive else _ZERO
-                work[_T + p] = rest if alive else -abs(t)
-                work[_W + p] = weight
-                work[_A + p] = alpha if alive else _ZERO
-                right[p] = work[_X + p] + x0
-                down[p] = dy
-                first[p] += weight * c0
-                first[PIXELS + p] += weight * c1
-                first[2 * PIXELS + p] += weight * c2
-                first[3 * PIXELS + p] += weight
+                band[_T + p] = rest if alive else -abs(t)
+                band[_W + p] = weight
+                band[_A + p] = alpha if alive else _ZERO
+                band[_B + p] = band[_X + p] + x0
+                band[_V + p] = dy
+                band[_COLOR + p] += weight * c0
+                band[_COLOR + PIXELS + p] += weight * c1
+                band[_COLOR + 2 * PIXELS + p] += weight * c2
+                band[_COLOR + 3 * PIXELS + p] += weight
             a, b, c = conics[0, g, 0], conics[0, g, 1], conics[0, g, 2]
             for k in range(1, cameras):
                 if not visible[k, g]:
                     continue
-                plane = planes[k]
+                plane = planes[k, first:]
                 x, y = means[k, g, 0] - means[0, g, 0], means[k, g, 1] - means[0, g, 1]
                 sx, sy, sxy = a * x + b * y, b * x + c * y, b - conics[k, g, 1]
                 sxx, syy = _HALF * (a - conics[k, g, 0]), _HALF * (c - conics[k, g, 2])
                 v0, v1, v2 = colors[k, g, 0] - c0, colors[k, g, 1] - c1, colors[k, g, 2] - c2
-                for p in range(PIXELS):
-                    dx, dy, weight = right[p], down[p], work[_W + p]
+                for p in range(past - first):
+                    dx, dy, weight = band[_B + p], band[_V + p], band[_W + p]
                     t = plane[3 * PIXELS + p]
                     s = dx * (sx + sxx * dx + sxy * dy) + dy * (sy + syy * dy)
-                    v = weight * s + work[_A + p] * t
+                    v = weight * s + band[_A + p] * t
                     plane[3 * PIXELS + p] = t - v
                     plane[p] += v * c0 + weight * v0
                     plane[PIXELS + p] += v * c1 + weight * v1
@@ -207,12 +219,13 @@ def composite_neighbours(begin, end, worker, bins, means, conics, colors, visibl
                     most = max(most, work[_T + p])
                 if most < _ZERO:
                     break
+        planes[0] = seen
         for k in range(1, cameras):  # what differs becomes what is seen
             plane = planes[k]
             for p in range(3 * PIXELS):
-                plane[p] += first[p]
+                plane[p] += seen[p]
             for p in range(3 * PIXELS, 4 * PIXELS):
-                plane[p] = first[p] - plane[p]
+                plane[p] = seen[p] - plane[p]
         wide = min(TILE, width - column * TILE)
         for k in range(cameras):
             for i in range(min(TILE, height - row * TILE)):
@@ -254,27 +267,32 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
         for k in range(count):
             g = gaussians[start + k]
             u0, y0, square, shear, drop, peak = _at_tile(coefficients[g], left, top)
-            save = saved[k]
-            for p in range(PIXELS):
-                dy = work[_Y + p] + y0
-                u = work[_X + p] + (shear * work[_Y + p] + u0)
+            first, past = _touched(bins.bands[start + k])
+            band = work[first:]
+            for p in range(past - first):
+                dy = band[_Y + p] + y0
+                u = band[_X + p] + (shear * band[_Y + p] + u0)
                 log2_alpha = square * u * u + (drop * dy * dy + peak)
                 alpha = _alpha(log2_alpha)
-                t = work[_T + p]
+                t = band[_T + p]
                 weight = alpha * t
                 rest = t - weight
                 alive = rest > _T_MIN
-                work[_T + p] = rest if alive else -abs(t)
+                band[_T + p] = rest if alive else -abs(t)
                 # The sign marks alphas that were cut to 0.999.
                 alpha = -alpha if log2_alpha > _LOG2_ALPHA_MAX else alpha
-                save[p] = alpha if alive else _ZERO
-                save[PIXELS + p] = weight if alive else _ZERO
+                band[_A + p] = alpha if alive else _ZERO
+                band[_W + p] = weight if alive else _ZERO
+            save = saved[k, first:]
+            for p in range(past - first):
+                save[p] = band[_W + p]
+                save[PIXELS + p] = band[_A + p]
         camera = tile // (tiles_x * tiles_y)
         work[_COLOR:] = _ZERO
         # The transmittance is no longer needed; in its place comes the gradient of alpha, 0 beyond the image's edge.
         for p in range(PIXELS):
             work[_T + p] = _ZERO
-            work[_A + p] = _ZERO
+            work[_B + p] = _ZERO
         wide = min(TILE, width - column * TILE)
         for i in range(min(TILE, height - row * TILE)):
             source = v_render[camera, row * TILE + i, column * TILE :]
@@ -284,22 +302,25 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
                     plane[j] = source[j, d]
             for j in range(wide):
                 work[_T + i * TILE + j] = v_alphas[camera, row * TILE + i, column * TILE + j, 0]
-        # work[_A] holds what lies behind the pair, composited and dotted with the image gradient.
+        # work[_B] holds what lies behind the pair, composited and dotted with the image gradient.
         for k in range(count - 1, -1, -1):
             pair = start + k
             g = gaussians[pair]
-            save = saved[k]
             u0, y0, square, shear, drop, peak = _at_tile(coefficients[g], left, top)
-            for p in range(PIXELS):
-                work[_W + p] = work[_T + p]
+            first, past = _touched(bins.bands[pair])
+            band, save = work[first:], saved[k, first:]
+            for p in range(past - first):
+                band[_W + p] = save[p]
+                band[_A + p] = save[PIXELS + p]
+                band[_V + p] = band[_T + p]
             for i in range(1, groups.shape[0]):
-                d, group = GROUP * i, groups[i]
+                d, group = GROUP * i, groups[i, first:]
                 c0, c1, c2, c3 = colors[g, d], colors[g, d + 1], colors[g, d + 2], colors[g, d + 3]
                 v0, v1, v2, v3 = _ZERO, _ZERO, _ZERO, _ZERO
-                for p in range(PIXELS):
-                    weight = save[PIXELS + p]
+                for p in range(past - first):
+                    weight = band[_W + p]
                     g0, g1, g2, g3 = group[p], group[PIXELS + p], group[2 * PIXELS + p], group[3 * PIXELS + p]
-                    work[_W + p] += c0 * g0 + c1 * g1 + c2 * g2 + c3 * g3
+                    band[_V + p] += c0 * g0 + c1 * g1 + c2 * g2 + c3 * g3
                     v0 += weight * g0
                     v1 += weight * g1
                     v2 += weight * g2
@@ -312,20 +333,20 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
             c0, c1, c2, c3 = colors[g, 0], colors[g, 1], colors[g, 2], colors[g, 3]
             m, mu, my, muu, muy, myy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
             v0, v1, v2, v3 = _ZERO, _ZERO, _ZERO, _ZERO
-            for p in range(PIXELS):
-                alpha, weight = save[p], save[PIXELS + p]
-                g0, g1 = work[_COLOR + p], work[_COLOR + PIXELS + p]
-                g2, g3 = work[_COLOR + 2 * PIXELS + p], work[_COLOR + 3 * PIXELS + p]
+            for p in range(past - first):
+                weight, alpha = band[_W + p], band[_A + p]
+                g0, g1 = band[_COLOR + p], band[_COLOR + PIXELS + p]
+                g2, g3 = band[_COLOR + 2 * PIXELS + p], band[_COLOR + 3 * PIXELS + p]
                 v0 += weight * g0
                 v1 += weight * g1
                 v2 += weight * g2
                 v3 += weight * g3
-                difference = work[_W + p] + c0 * g0 + c1 * g1 + c2 * g2 + c3 * g3 - work[_A + p]
-                work[_A + p] += abs(alpha) * difference
+                difference = band[_V + p] + c0 * g0 + c1 * g1 + c2 * g2 + c3 * g3 - band[_B + p]
+                band[_B + p] += abs(alpha) * difference
                 v = weight * difference if alpha > _ZERO else _ZERO
-                work[_W + p] = v
-                dy = work[_Y + p] + y0
-                u = work[_X + p] + (shear * work[_Y + p] + u0)
+                band[_V + p] = v
+                dy = band[_Y + p] + y0
+                u = band[_X + p] + (shear * band[_Y + p] + u0)
                 vu, vy = v * u, v * dy
                 m += v
                 mu += vu
@@ -347,10 +368,10 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
                 v_colors[pair, 3] = v3
             if want_moments and want_abs:
                 ax, ay = _ZERO, _ZERO
-                for p in range(PIXELS):
-                    v = work[_W + p]
-                    dy = work[_Y + p] + y0
-                    slope_x = square * (work[_X + p] + (shear * work[_Y + p] + u0))
+                for p in range(past - first):
+                    v = band[_V + p]
+                    dy = band[_Y + p] + y0
+                    slope_x = square * (band[_X + p] + (shear * band[_Y + p] + u0))
                     ax += abs(v * slope_x)
                     ay += abs(v * (shear * slope_x + drop * dy))
                 moments[pair, 6] = ax
