@@ -310,15 +310,13 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
             first, past = _touched(bins.bands[pair])
             band, save = work[first:], saved[k, first:]
             for p in range(past - first):
-                band[_W + p] = save[p]
-                band[_A + p] = save[PIXELS + p]
                 band[_V + p] = band[_T + p]
             for i in range(1, groups.shape[0]):
                 d, group = GROUP * i, groups[i, first:]
                 c0, c1, c2, c3 = colors[g, d], colors[g, d + 1], colors[g, d + 2], colors[g, d + 3]
                 v0, v1, v2, v3 = _ZERO, _ZERO, _ZERO, _ZERO
                 for p in range(past - first):
-                    weight = band[_W + p]
+                    weight = save[p]
                     g0, g1, g2, g3 = group[p], group[PIXELS + p], group[2 * PIXELS + p], group[3 * PIXELS + p]
                     band[_V + p] += c0 * g0 + c1 * g1 + c2 * g2 + c3 * g3
                     v0 += weight * g0
@@ -334,7 +332,7 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
             m, mu, my, muu, muy, myy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
             v0, v1, v2, v3 = _ZERO, _ZERO, _ZERO, _ZERO
             for p in range(past - first):
-                weight, alpha = band[_W + p], band[_A + p]
+                weight, alpha = save[p], save[PIXELS + p]
                 g0, g1 = band[_COLOR + p], band[_COLOR + PIXELS + p]
                 g2, g3 = band[_COLOR + 2 * PIXELS + p], band[_COLOR + 3 * PIXELS + p]
                 v0 += weight * g0
