@@ -155,6 +155,7 @@ class PosePipeline(VanillaPipeline):
         looks = [looked_at(splat, views) for splat, views in zip(splats, self.views, strict=True)]
         splats = [splat.select(share >= HIDDEN) for splat, (_, share) in zip(splats, looks, strict=True)]
         self._seen = [seen[share >= HIDDEN] for seen, share in looks]
+        self._clear = [share[share >= HIDDEN] for _, share in looks]
         self.model.worlds = torch.from_numpy(np.stack([state.placement for state in capture.states])).to(device)
         if capture.worlds != "shared":
             self._bring_together(splats, capture)
@@ -333,15 +334,22 @@ class PosePipeline(VanillaPipeline):
         """End the search for poses, then keep one set of Gaussians, in the canonical frame."""
         model = self.model
         splats = [model.state_splat(s).detach() for s in range(model.num_states)]
+        as_begun = model.config.learn_gaussians == "after"
         T, model.covariance, model.held_ratio = refine_known_poses(
-            splats, self.views, model.poses.T(), self._frozen, self._reference, self._known, self._cameras_refined
+            splats,
+            self.views,
+            model.poses.T(),
+            self._frozen,
+            self._reference,
+            self._known,
+            self._cameras_refined,
+            self._clear if as_begun else None,
         )
         model.poses.commit(T)
         known = model.covariance.isfinite().flatten(2).all(-1)
         self._note_unknown(known)
         self._note_turned(model.covariance)
-        seen = self._seen if model.config.learn_gaussians == "after" else None
-        merged = Splat.cat(merge_parts(splats, self.views, T, known, seen))
+        merged = Splat.cat(merge_parts(splats, self.views, T, known, self._seen if as_begun else None))
         params = gauss_params_from_splat(merged)
         for name, parameter in params.items():
             model.gauss_params[name] = parameter

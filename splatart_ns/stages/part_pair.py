@@ -48,6 +48,11 @@ class PartView:
     """Number of the part's own pixels at full size."""
     factor: int
 
+    @property
+    def eps2d(self) -> float:
+        """The blur of 0.3 pixels^2 of the full image, and what averaging its pixels adds."""
+        return 0.3 / self.factor**2 + (1 - 1 / self.factor**2) / 12
+
     def render(self, splat: Splat, T: Tensor, first_order: bool = False) -> Tensor:
         """The splat under motions or similarities [K, 4, 4]: [K, H, W, 4], colours over black and accumulation.
 
@@ -57,14 +62,19 @@ class PartView:
         height, width = self.weight.shape
         gaussians = splat.means, splat.quats, splat.scales, splat.opacities
         colors = sh_colors(splat.means, splat.sh, viewmats, splat.sh_degree)
-        # The blur of 0.3 pixels^2 of the full image, and what averaging its pixels adds.
-        eps2d = 0.3 / self.factor**2 + (1 - 1 / self.factor**2) / 12
         if first_order:
-            return rasterize_neighbours(*gaussians, colors, viewmats, self.K, width, height, eps2d)
+            return rasterize_neighbours(*gaussians, colors, viewmats, self.K, width, height, self.eps2d)
         # Accumulation is what a channel shows that is one everywhere.
         channels = torch.cat([colors, torch.ones_like(colors[..., :1])], -1)
         Ks = self.K.expand(len(viewmats), 3, 3)
-        return rasterization(*gaussians, channels, viewmats, Ks, width, height, eps2d=eps2d)[0]
+        return rasterization(*gaussians, channels, viewmats, Ks, width, height, eps2d=self.eps2d)[0]
+
+    def share(self, splat: Splat, chosen: Tensor) -> Tensor:
+        """What the chosen Gaussians [N] bool of a splat make up of the view [H, W], 0..1."""
+        height, width = self.weight.shape
+        gaussians = splat.means, splat.quats, splat.scales, splat.opacities, chosen[:, None].to(splat.means)
+        camera = self.viewmat[None], self.K[None], width, height
+        return rasterization(*gaussians, *camera, eps2d=self.eps2d)[0][0, ..., 0]
 
     def difference(
         self,

@@ -12,11 +12,13 @@ from torch import Tensor
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import inverse, so3_log, transform_points
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.covisibility import compared_by_common, covisible
 from splatart_ns.stages.joint import PRISMATIC_BELOW
 from splatart_ns.stages.part_pair import CHROMA_WEIGHT, PartPair, part_pair
 from splatart_ns.stages.refinement import motion_covariance, refine, rotation_held_ratio, shifted
 from splatart_ns.stages.render_choice import FINE_PIXELS, VIEWS
 from splatart_ns.stages.symmetry import settle_turn
+from splatart_ns.stages.visibility import clearest
 
 ALL_VIEWS = 60
 """Views of each state that the last refinement looks at, where there are so many."""
@@ -28,7 +30,12 @@ MAYBE_SLIDING = math.radians(10)
 
 
 def refine_poses(
-    splats: Sequence[Splat], views: Sequence[Sequence[View]], T: Tensor, frozen: Tensor, central: bool = False
+    splats: Sequence[Splat],
+    views: Sequence[Sequence[View]],
+    T: Tensor,
+    frozen: Tensor,
+    central: bool = False,
+    clear: Sequence[Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The last rung of the search for poses: Gauss-Newton on all views, and the certainty that they give.
 
@@ -40,12 +47,15 @@ def refine_poses(
     Where a part rests, one that slides past it does not turn: what it seems to turn by is error, which its shift makes
     up for. So parts whose images fit a mere shift as well are held to that.
 
+    Parts are compared by what both states show of them (see `covisibility`).
+
     Args:
         splats: One labelled splat per state.
         views: Training views of each state.
         T: Poses [S, P, 4, 4], near the optimum.
         frozen: Which of them stay as they are [S, P] bool.
         central: See `refine`.
+        clear: `clearest` of each state's Gaussians in its own views [N], if it has been measured.
 
     Returns:
         The refined poses, and their covariances [S, P, 6, 6]: T = se3_exp(xi) T_true, xi = (translation, rotation). NaN
@@ -55,6 +65,8 @@ def refine_poses(
     S, P = T.shape[:2]
     covariances = torch.zeros(S, P, 6, 6, dtype=torch.float64, device=T.device)
     something_rests = bool(frozen.all(0).any())
+    clear = clear or [clearest(*state) for state in zip(splats, views, strict=True)]
+    common = [covisible(*((x[0], x[s]) for x in (splats, views, clear)), T[s]) for s in range(1, S)]
     for p in range(P):
         refined, slides = 0, {}
         for s in range(1, S):
@@ -62,7 +74,8 @@ def refine_poses(
             if pair is None:
                 covariances[s, p] = torch.nan
                 continue
-            pair, equations = replace(pair, **IN_EVEN_LIGHT), None
+            of_part = [both[x.part_ids == p + 1] for both, x in zip(common[s - 1], (splats[0], splats[s]), strict=True)]
+            pair, equations = compared_by_common(replace(pair, **IN_EVEN_LIGHT), of_part), None
             if not frozen[s, p]:
                 found = refine(pair, T[s, p], MAX_ITERATIONS, central=central)
                 T[s, p], equations = found.T, found.equations

@@ -56,6 +56,7 @@ def refine_known_poses(
     reference: Sequence[int],
     known: Tensor,
     central: bool = False,
+    clear: Sequence[Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`refine_poses` and `rotation_held_ratios` of every part against its reference state.
 
@@ -66,7 +67,7 @@ def refine_known_poses(
         frozen: Which of them stay as they are [S, P] bool.
         reference: Each part's reference state.
         known: Which poses were found [S, P] bool.
-        central: See `refine`.
+        central, clear: See `refine_poses`.
 
     Returns:
         The refined poses, their covariances [S, P, 6, 6] (NaN where not known), and the ratios [P, P].
@@ -77,7 +78,9 @@ def refine_known_poses(
     frozen = frozen & known  # where no motion was found nothing is known to rest
     frozen[list(reference), torch.arange(P)] = True
     for order, parts in _groups(reference, known):
-        refined, certainty = refine_poses(*_chosen(splats, views, order, parts), M[order], frozen[order], central)
+        chosen = _chosen(splats, views, order, parts)
+        shares = clear and [clear[s][_of(splats[s], parts)] for s in order]
+        refined, certainty = refine_poses(*chosen, M[order], frozen[order], central, shares)
         for p in parts:
             M[order, p], covariances[order, p] = refined[:, p], certainty[:, p]
     for p, first in enumerate(reference):
@@ -114,9 +117,12 @@ def _chosen(
     splats: Sequence[Splat], views: Sequence[Sequence[View]], states: Sequence[int], parts: Sequence[int]
 ) -> tuple[list[Splat], list[Sequence[View]]]:
     """Some states in another order, with some parts (counted from 0) alone."""
-    ids = torch.tensor(parts) + 1
-    alone = [splats[s].select(torch.isin(splats[s].part_ids, ids.to(splats[s].part_ids))) for s in states]
-    return alone, [views[s] for s in states]
+    return [splats[s].select(_of(splats[s], parts)) for s in states], [views[s] for s in states]
+
+
+def _of(splat: Splat, parts: Sequence[int]) -> Tensor:
+    """Which Gaussians [N] are of some parts (counted from 0)."""
+    return torch.isin(splat.part_ids, torch.tensor(parts).to(splat.part_ids) + 1)
 
 
 def _sure(M: Tensor, covariance: Tensor, centroid: Tensor, radius: Tensor) -> bool:
