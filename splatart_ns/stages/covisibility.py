@@ -42,7 +42,7 @@ def covisible(
     return shown[0], shown[1]
 
 
-def compared_by_common(pair: PartPair, common: tuple[Tensor, Tensor]) -> PartPair:
+def compared_by_common(pair: PartPair, common: Sequence[Tensor]) -> PartPair:
     """The pair without the pixels that show what only one state shows.
 
     `common`: which Gaussians of the part in each state [N] bool both states show.
@@ -51,12 +51,9 @@ def compared_by_common(pair: PartPair, common: tuple[Tensor, Tensor]) -> PartPai
         return pair
     pieces = []
     for splat, views, both in zip(pair.splats, pair.views, common, strict=True):
-        alone = [view.share(splat, ~both) for view in views]
-        own = sum(float((view.weight * view.rgba[..., 3]).sum()) for view in views)
-        left = sum(
-            float((view.weight * view.rgba[..., 3] * (1 - a)).sum()) for view, a in zip(views, alone, strict=True)
-        )
+        masked = tuple(replace(view, weight=view.weight * (1 - view.share(splat, ~both))) for view in views)
+        own, left = (sum(float((v.weight * v.rgba[..., 3]).sum()) for v in some) for some in (views, masked))
         if left < LEAST * own:
             return pair
-        pieces.append(tuple(replace(v, weight=v.weight * (1 - a)) for v, a in zip(views, alone, strict=True)))
+        pieces.append(masked)
     return replace(pair, views=(pieces[0], pieces[1]))
