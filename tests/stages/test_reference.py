@@ -4,9 +4,10 @@ from part_scene import angle_deg, box, motion, nearby, photograph
 
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages import reference
 from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.reference import reference_states, refine_known_poses, since_reference, since_state_0
-from splatart_ns.stages.visibility import visibility
+from splatart_ns.stages.visibility import clearest, visibility
 
 EYE = torch.eye(4, dtype=torch.float64)
 MOVES = [EYE, motion((0, 0, 30), (0.1, 0.2, 0.1)), motion((0, 0, 70), (0.3, 0.1, 0.2))]
@@ -88,6 +89,27 @@ def test_a_pose_at_state_0_that_is_sure_turns_motions_into_those_since_state_0(s
     assert covariances.isfinite().all() and not covariances[0].any()
     # The reference state's own pose is as uncertain as the one that it was turned by.
     assert (torch.linalg.eigvalsh(covariances[1:, 1])[:, 0] > 0).all()
+
+
+def test_how_clearly_gaussians_are_seen_is_measured_where_it_is_not_given(scene, monkeypatch):
+    splats, views = scene
+    T = torch.stack([torch.stack([EYE, T]) for T in MOVES])
+    frozen, known = torch.ones(3, 2) > 0, torch.tensor([[True, False], [True, True], [True, True]])
+    told = []
+
+    def watched(splats, views, T, frozen, central, clear):
+        told.append(clear or [clearest(s, v) for s, v in zip(splats, views, strict=True)])
+        return T, torch.zeros(*T.shape[:2], 6, 6, dtype=torch.float64)
+
+    monkeypatch.setattr(reference, "refine_poses", watched)
+    given = [clearest(s, v) for s, v in zip(splats, views, strict=True)]
+    for clear in (None, given):
+        refine_known_poses(splats, views, T, frozen, [0, 1], known, clear=clear)
+    measured, passed = told[: len(told) // 2], told[len(told) // 2 :]
+    assert [[len(x) for x in of] for of in measured] == [[len(x) for x in of] for of in passed]
+    # Alone, a part hides nothing of itself that the others do not hide.
+    for alone, among in zip(sum(measured, []), sum(passed, []), strict=True):
+        assert (alone >= among - 1e-4).all()
 
 
 def test_a_part_is_not_merged_from_a_state_where_its_pose_is_not_known(scene):
