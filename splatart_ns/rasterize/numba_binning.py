@@ -34,7 +34,7 @@ class Bins(NamedTuple):
     gaussians: np.ndarray
     """[E] Gaussian of each pair."""
     bands: np.ndarray
-    """[E] Which bands of the tile it may touch: 16 times the first, and one past the last."""
+    """[E] Which bands of the tile it may touch: 16 times the first, plus one past the last."""
     pairs: np.ndarray
     """[E] pair of each slot."""
     order: np.ndarray

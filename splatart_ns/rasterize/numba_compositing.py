@@ -2,8 +2,8 @@
 
 A tile's 64 pixels lie side by side in one small workspace, at fixed offsets, so that every inner loop runs over them in
 vector registers: LLVM vectorises them only where it sees that nothing overlaps and that no index is negative. The loops
-leave out the bands of rows that a Gaussian does not reach, a third of all. The first four channels of colour share the
-loops of the geometry; each further group of four has one loop of its own.
+leave out the bands of rows that a Gaussian does not reach, a third where it is small. The first four channels of colour
+share the loops of the geometry; each further group of four has one loop of its own.
 """
 
 from __future__ import annotations

@@ -120,8 +120,9 @@ def infer_tree(
     places, motions, known = place_unseen(tree, motions, known)
     points = {p: transform_points(places[p].to(x), x) for p, x in points.items()}
     for p, x in points.items():
-        # Where more states tell, what errs in one of them counts for less.
-        errors[p] = surface_error(x.double(), motions[p].double(), floor / max(1, len(motions[p]) - 1), radius)
+        # Beside what the images say, points count for less the more motions there are (measured; see the README).
+        share = 1 if covariances is None else max(1, len(motions[p]) - 1)
+        errors[p] = surface_error(x.double(), motions[p].double(), floor / share, radius)
         if covariances is not None:
             unknown = (10 * radius) ** 2 * torch.eye(6).to(errors[p])
             errors[p] = errors[p] + torch.where(known[p][:, None, None], covariances[p].to(errors[p]), unknown)

@@ -9,9 +9,10 @@ from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp
 from splatart_ns.stages.arborescence import cheapest_parents
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.contact import Contact, find_contacts
+from splatart_ns.stages.joint import NOISE
 from splatart_ns.stages.joint_constraint import JointConstraint, parse_constraints
 from splatart_ns.stages.joint_fit import JointFit
-from splatart_ns.stages.joint_pairs import fit_pairs
+from splatart_ns.stages.joint_pairs import fit_pairs, surface_error
 from splatart_ns.stages.tree import build_tree, choose_root, infer_tree, object_radius
 
 Z, X, Y = (torch.tensor(v, dtype=torch.float64) for v in ((0, 0, 1.0), (1.0, 0, 0), (0, 1.0, 0)))
@@ -134,6 +135,22 @@ def test_two_drawers_hang_on_the_body_and_close_no_loop(states):
     tree = infer_tree(points, motions_of(truth, q))
     assert edges(tree) == {(1, 2), (1, 3)} and all(j.fit.type == "prismatic" for j in tree.joints)
     assert not tree.loops and [{j.parent, j.child} for j in tree.rejected] == [{2, 3}]
+
+
+def test_points_count_for_less_beside_images_with_more_states_and_for_all_without_images(monkeypatch):
+    noises = []
+
+    def watched(points, T, noise, radius):
+        noises.append(noise)
+        return surface_error(points, T, noise, radius)
+
+    monkeypatch.setattr("splatart_ns.stages.tree.surface_error", watched)
+    for states, share in ((2, 0.3), (4, 0.1), (None, 1.0)):
+        points, truth, q = drawers(states or 4)
+        tiny = 1e-10 * torch.eye(6, dtype=torch.float64).repeat(len(q), 1, 1)
+        noises.clear()
+        infer_tree(points, motions_of(truth, q), covariances={p: tiny for p in points} if states else None)
+        assert noises == pytest.approx([share * NOISE] * 3)
 
 
 def test_more_states_reject_more_false_pairs():
