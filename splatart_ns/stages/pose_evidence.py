@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import inverse, so3_log, transform_points
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.covisibility import compared_by_common, covisible
+from splatart_ns.stages.flush import compared_by_seen, in_sight, is_flush, surface_depths, without_neighbours
 from splatart_ns.stages.joint import PRISMATIC_BELOW
 from splatart_ns.stages.part_pair import CHROMA_WEIGHT, PartPair, part_pair
 from splatart_ns.stages.refinement import motion_covariance, refine, rotation_held_ratio, shifted
@@ -22,7 +24,7 @@ from splatart_ns.stages.visibility import clearest
 
 ALL_VIEWS = 60
 """Views of each state that the last refinement looks at, where there are so many."""
-MAX_ITERATIONS = 8
+MAX_ITERATIONS = 16
 IN_EVEN_LIGHT = {"chroma_weight": CHROMA_WEIGHT, "brightness_weight": 1.0, "even_light": True}
 """How that looks at a `PartPair`."""
 MAYBE_SLIDING = math.radians(10)
@@ -47,7 +49,8 @@ def refine_poses(
     Where a part rests, one that slides past it does not turn: what it seems to turn by is error, which its shift makes
     up for. So parts whose images fit a mere shift as well are held to that.
 
-    Parts are compared by what both states show of them (see `covisibility`).
+    Parts are compared by what both states show of them (see `covisibility`); what lies flush with others, also by where
+    these show that it is not (see `flush`).
 
     Args:
         splats: One labelled splat per state.
@@ -67,15 +70,25 @@ def refine_poses(
     something_rests = bool(frozen.all(0).any())
     clear = clear or [clearest(*state) for state in zip(splats, views, strict=True)]
     common = [covisible(*((x[0], x[s]) for x in (splats, views, clear)), T[s]) for s in range(1, S)]
+    depths = cache(lambda s: surface_depths(splats[s], views[s]))
     for p in range(P):
         refined, slides = 0, {}
+        flush = [is_flush(some, p + 1) for some in views]
         for s in range(1, S):
-            pair = part_pair((splats[0], splats[s]), (views[0], views[s]), p + 1, ALL_VIEWS, FINE_PIXELS, near=True)
+            compared = views[0], views[s]
+            if flush[0] or flush[s]:
+                compared = tuple(
+                    [without_neighbours(v, d, p + 1) for v, d in zip(views[t], depths(t), strict=True)] for t in (0, s)
+                )
+            pair = part_pair((splats[0], splats[s]), compared, p + 1, ALL_VIEWS, FINE_PIXELS, near=True)
             if pair is None:
                 covariances[s, p] = torch.nan
                 continue
             of_part = [both[x.part_ids == p + 1] for both, x in zip(common[s - 1], (splats[0], splats[s]), strict=True)]
             pair, equations = compared_by_common(replace(pair, **IN_EVEN_LIGHT), of_part), None
+            if flush[0] or flush[s]:
+                seen = [in_sight(x, views[t], depths(t), p + 1) for x, t in zip(pair.splats, (0, s), strict=True)]
+                pair = compared_by_seen(pair, T[s, p], seen)
             if not frozen[s, p]:
                 found = refine(pair, T[s, p], MAX_ITERATIONS, central=central)
                 T[s, p], equations = found.T, found.equations

@@ -1,0 +1,124 @@
+"""Parts that lie flush with others, like a shut door in its frame, and what tells where those are.
+
+Around a part the images show other parts, which might hide it, so their pixels say nothing of where it is. But where
+the part's surface goes on into them, nothing hides it: they say that it is not there. Without them a shut door may
+cover its frame at no cost, and only its far edges hold it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from splatart_ns.capture.capture import UNLABELLED
+from splatart_ns.capture.view import View, box
+from splatart_ns.geometry.se3 import inverse, matrix_from_quat, transform_points
+from splatart_ns.rasterize.render import render
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.part_pair import PartPair, best_views
+from splatart_ns.stages.threads import side_by_side
+
+FLUSH = 0.6
+"""A part is flush where the images show more than this share of its border against other parts: links of robots have
+up to .5, shut doors and drawers .7 to 1."""
+REACH = 8
+"""Pixels around a part that can say that it is not there."""
+TOLERANCE = 2.0
+"""How much nearer another part must be to hide it, in pixels of its own distance."""
+VIEWS = 40
+"""More views than this do not change what share of a border is flush."""
+EXTENT = 2.0
+"""How far out a Gaussian must be in sight, in standard deviations."""
+TRACE = 0.1
+"""The share of a pixel from which on it does not count, if Gaussians make it up that are not in sight to there."""
+
+
+def is_flush(views: Sequence[View], part: int) -> bool:
+    """Whether most of a part's border lies against other parts."""
+    against = torch.zeros(2)
+    for view in best_views(views, part, VIEWS):
+        if view.labels is None:
+            continue
+        for labels in (view.labels, view.labels.T):
+            for inside, beside in ((labels[1:], labels[:-1]), (labels[:-1], labels[1:])):
+                beside = beside[(inside == part) & (beside != part) & (beside != UNLABELLED)]
+                against += torch.stack([(beside == 0).sum(), (beside > 0).sum()]).cpu()
+    return bool(against[1] > FLUSH * against.sum())
+
+
+def surface_depths(splat: Splat, views: Sequence[View]) -> list[Tensor]:
+    """How far a splat's surface is in each view [H, W], infinite where it is not."""
+
+    @torch.no_grad()
+    def look(view: View) -> Tensor:
+        camera = view.viewmat[None], view.K[None], view.width, view.height
+        rendering = render(splat, *camera, sh_degree=0)
+        return torch.where(rendering.accumulation > 0.5, rendering.depth, torch.inf)[0, ..., 0]
+
+    return side_by_side(look, views)
+
+
+def without_neighbours(view: View, depth: Tensor, part: int) -> View:
+    """The view with background where other parts' pixels say that a part is not there.
+
+    Those are the ones around it whose surface, of `depth` [H, W], does not lie before that of the part's nearest pixel.
+    """
+    own = None if view.labels is None else (view.labels == part) & depth.isfinite()
+    if own is None or not own.any():
+        return view
+    left, top, right, bottom = box(own)
+    piece = slice(max(0, top - REACH), bottom + REACH), slice(max(0, left - REACH), right + REACH)
+    labels, depth = view.labels[piece], depth[piece]
+    distance, nearest = distance_transform_edt(~own[piece].cpu().numpy(), return_indices=True)
+    distance, (row, column) = (torch.from_numpy(x).to(depth.device) for x in (distance, nearest))
+    surface = depth[row.long(), column.long()] * (1 - TOLERANCE / view.K[0, 0])
+    other = (labels != part) & (labels != 0) & (labels != UNLABELLED)
+    absent = other & (distance <= REACH) & depth.isfinite() & (surface <= depth)
+    emptied = {}
+    for name, pixels in (("labels", view.labels), ("alpha", view.alpha)):
+        if pixels is not None:
+            emptied[name] = pixels.clone()
+            emptied[name][piece][absent] = 0
+    return replace(view, **emptied)
+
+
+def in_sight(splat: Splat, views: Sequence[View], depths: Sequence[Tensor], part: int) -> Tensor:
+    """Which Gaussians of a part [N] bool some view shows from end to end.
+
+    The others reach, as nothing kept them from it, into what no view shows, and are seen to when the part moves.
+    """
+    lengths, order = splat.scales.sort(dim=-1, descending=True)
+    axes = matrix_from_quat(F.normalize(splat.quats, dim=-1)).mT.gather(1, order[..., None].expand(-1, -1, 3))
+    along = (EXTENT * lengths[..., None] * axes)[:, :2]
+    ends = torch.cat([splat.means[:, None] + along, splat.means[:, None] - along], 1)
+    seen = torch.zeros(ends.shape[:2], dtype=torch.bool, device=ends.device)
+    for view, depth in zip(views, depths, strict=True):
+        if view.labels is None:
+            continue
+        x, y, z = transform_points(view.viewmat, ends).unbind(-1)
+        z = z.clamp_min(1e-6)
+        column = (x / z * view.K[0, 0] + view.K[0, 2]).floor().long()
+        row = (y / z * view.K[1, 1] + view.K[1, 2]).floor().long()
+        inside = (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
+        row, column = row.clamp(0, view.height - 1), column.clamp(0, view.width - 1)
+        label = view.labels[row, column]
+        reached = z <= depth[row, column] + TOLERANCE * (z / view.K[0, 0] + lengths[:, 2:])
+        seen |= inside & reached & ((label == part) | (label == 0))
+    return seen.all(1)
+
+
+def compared_by_seen(pair: PartPair, T: Tensor, seen: Sequence[Tensor]) -> PartPair:
+    """The pair without the pixels that show, after the motion T [4, 4], Gaussians that are not `in_sight` in their own
+    state [N] bool each."""
+    views = []
+    ways = zip(pair.splats, (T, inverse(T)), seen, reversed(pair.views), strict=True)
+    for splat, motion, known, elsewhere in ways:
+        moved = splat.transformed(motion)
+        clear = [(1 - v.share(moved, ~known) / TRACE).clamp_min(0) for v in elsewhere]
+        views.append(tuple(replace(v, weight=v.weight * c) for v, c in zip(elsewhere, clear, strict=True)))
+    return replace(pair, views=(views[1], views[0]))
