@@ -40,11 +40,14 @@ own length counted as fixed."""
 _STACKED = 0.02
 """Cost of a joint that does not hang on the root: two drawers that touch each other and the body alike slide in the
 body both."""
-_STACKED_SLIDES = 0.1
-"""That of a slide on a part that slides on the root itself, both along the way the child slides on the root. It says
-nothing that the other two do not, and a drawer shows where it nears its neighbour but not where it touches the body."""
+_STACKED_ALIKE = 0.1
+"""That of a slide on a part that slides on the root itself, both along the way the child slides on the root, and of a
+hinge whose axis its parent and the child itself turn about on the root, as doors above each other do. It says nothing
+that the other two do not, and a drawer shows where it nears its neighbour but not where it touches the body."""
 _PARALLEL = 0.98
-"""Least cosine of the angle between slides along one way."""
+"""Least cosine of the angle between slides along one way, and hinges about one line."""
+_ONE_LINE = 0.1
+"""How far such hinges may lie apart, as a share of the object's radius."""
 _IN_TOUCH = 0.1
 """Largest gap of two parts of a group that only a free joint carries, as a share of the object's radius."""
 
@@ -161,7 +164,9 @@ def build_tree(
     for (parent, child), fit in joints.items():
         if fit.accepted:
             joint = _weighed(parent, child, fit, contacts[_pair(parent, child)], object_radius)
-            graph[parent, child] = replace(joint, cost=joint.cost + _stacked(joints, parent, child, root))
+            graph[parent, child] = replace(
+                joint, cost=joint.cost + _stacked(joints, parent, child, root, object_radius)
+            )
     allowed = {(a, b): j.cost for (a, b), j in graph.items() if required.get(b, a) == a and required.get(a) != b}
     parents = cheapest_parents(allowed, root)
     reached, chosen = {root}, []
@@ -225,15 +230,27 @@ def _weighed(parent: int, child: int, fit: JointFit, contact: Contact, object_ra
     return Joint(parent, child, fit, contact.gap, cost)
 
 
-def _stacked(joints: Mapping[tuple[int, int], JointFit], parent: int, child: int, root: int) -> float:
+def _stacked(
+    joints: Mapping[tuple[int, int], JointFit], parent: int, child: int, root: int, object_radius: float
+) -> float:
     """What a joint costs for not hanging on the root."""
     if parent == root:
         return 0.0
-    slides = [joints.get(edge) for edge in ((parent, child), (root, parent), (root, child))]
-    if any(fit is None or not fit.accepted or fit.type != "prismatic" for fit in slides):
+    fits = [joints.get(edge) for edge in ((parent, child), (root, parent), (root, child))]
+    if any(fit is None or not fit.accepted for fit in fits):
         return _STACKED
-    axes = torch.stack([fit.axis for fit in slides])
-    return _STACKED_SLIDES if bool(((axes @ axes.T).abs() > _PARALLEL).all()) else _STACKED
+    kinds = {fit.type for fit in fits}
+    if kinds not in ({"prismatic"}, {"revolute"}):
+        return _STACKED
+    axes = torch.stack([fit.axis for fit in fits])
+    if not bool(((axes @ axes.T).abs() > _PARALLEL).all()):
+        return _STACKED
+    if kinds == {"revolute"}:
+        origins = torch.stack([fit.origin for fit in fits])
+        apart = torch.linalg.cross(origins[:, None] - origins, axes.expand(3, 3, 3)).norm(dim=-1)
+        if bool((apart > _ONE_LINE * object_radius).any()):
+            return _STACKED
+    return _STACKED_ALIKE
 
 
 def _closes_loop(tree: KinematicTree, joint: Joint, contact: Contact, object_radius: float) -> bool:

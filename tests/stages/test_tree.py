@@ -137,6 +137,34 @@ def test_two_drawers_hang_on_the_body_and_close_no_loop(states):
     assert not tree.loops and [{j.parent, j.child} for j in tree.rejected] == [{2, 3}]
 
 
+@pytest.mark.parametrize("states", [2, 3])
+def test_doors_above_each_other_hang_on_the_body_even_if_nearer_to_each_other(states):
+    """They turn about one line, so that the lower could hang on the upper as well."""
+    points = {
+        1: box((0.46, 0.5, 0), (0.8, 0.04, 2), 1, count=2000),
+        2: box((0, 0.04, 0.5), (0.05, 0.9, 1), 5, count=2000),
+        3: box((0, 0.04, -0.5), (0.05, 0.9, 1), 6, count=2000),
+    }
+    truth = KinematicTree([1, 2, 3], 1, [true_joint(1, k, "revolute", Z, (0, 0.49, 0)) for k in (2, 3)])
+    q = torch.tensor([[0.0, 0.0], [0.5, 0.6], [0.9, 0.8]], dtype=torch.float64)[:states]
+    contacts = find_contacts(points, motions_of(truth, q))
+    assert contacts[2, 3].gap < contacts[1, 3].gap
+    assert edges(infer_tree(points, motions_of(truth, q))) == {(1, 2), (1, 3)}
+
+
+def test_a_hinge_elsewhere_than_its_parents_hangs_on_it():
+    """The second half of a folding door turns about a line beside that of the first."""
+    points = {
+        1: box((0.3, 0, 0), (0.6, 1.2, 2), 1),
+        2: box((-0.05, 0.35, 0), (0.04, 0.5, 1.9), 2),
+        3: box((-0.05, -0.15, 0), (0.04, 0.5, 1.9), 3),
+    }
+    joints = [true_joint(1, 2, "revolute", Z, (-0.05, 0.6, 0)), true_joint(2, 3, "revolute", Z, (-0.05, 0.1, 0))]
+    truth = KinematicTree([1, 2, 3], 1, joints)
+    q = torch.tensor([[0.0, 0.0], [-0.7, 1.2]], dtype=torch.float64)
+    assert edges(infer_tree(points, motions_of(truth, q))) == {(1, 2), (2, 3)}
+
+
 def test_points_count_for_less_beside_images_with_more_states_and_for_all_without_images(monkeypatch):
     noises = []
 
@@ -469,22 +497,29 @@ def test_a_required_joint_that_nothing_explains_is_free():
 
 
 @pytest.mark.parametrize(
-    "kind, closer, parent",
-    [("prismatic", 0.07, 1), ("prismatic", 0.15, 2), ("revolute", 0.01, 1), ("revolute", 0.05, 2)],
+    "kind, apart, closer, parent",
+    [
+        ("prismatic", 0.0, 0.07, 1),
+        ("prismatic", 0.0, 0.15, 2),
+        ("revolute", 0.0, 0.07, 1),
+        ("revolute", 0.0, 0.15, 2),
+        ("revolute", 0.2, 0.01, 1),
+        ("revolute", 0.2, 0.05, 2),
+    ],
 )
-def test_between_nearly_equal_parents_the_root_wins(kind, closer, parent):
+def test_between_nearly_equal_parents_the_root_wins(kind, apart, closer, parent):
     """Part 3 moves against the root and against part 2, and is by `closer` radii nearer to part 2. Of slides along one
-    way it takes more: two drawers show that they are neighbours, and not where they touch the body."""
+    way, and of hinges not `apart`, it takes more: two drawers, and two doors one above the other, show that they are
+    neighbours, and not where they touch the body."""
 
-    def move(values):
-        return JointFit(kind, X, torch.zeros(3).double(), 0.0, torch.tensor(values).double(), residual=0.0)
+    def move(values, y=0.0):
+        return JointFit(kind, X, y * Y, 0.0, torch.tensor(values).double(), residual=0.0)
 
-    joints = {(1, 2): move([0.0, 0.2]), (1, 3): move([0.0, 0.3]), (2, 3): move([0.0, 0.1])}
+    joints = {(1, 2): move([0.0, 0.2]), (1, 3): move([0.0, 0.3], apart), (2, 3): move([0.0, 0.1])}
     joints |= {(b, a): fit for (a, b), fit in joints.items()}
     gaps = {(1, 2): 0.02, (1, 3): 0.16, (2, 3): 0.16 - closer}
-    contacts = {
-        pair: Contact(gap, torch.zeros(1, 3).double(), 2 * (torch.zeros(1, 3).double(),)) for pair, gap in gaps.items()
-    }
+    on_both = torch.stack([0 * Y, apart * Y])
+    contacts = {pair: Contact(gap, on_both, (on_both, on_both)) for pair, gap in gaps.items()}
     tree = build_tree([1, 2, 3], joints, contacts, 1, 1.0)
     assert {j.child: j.parent for j in tree.joints} == {2: 1, 3: parent}
 
