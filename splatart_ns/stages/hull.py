@@ -1,4 +1,4 @@
-"""Where Gaussians start: points inside the visual hull of the silhouettes, each part with its share."""
+"""Where Gaussians start: points in and on the visual hull of the silhouettes, each part with its share."""
 
 from __future__ import annotations
 
@@ -19,6 +19,10 @@ POINTS_PER_PIXEL, POINTS_PER_PART = 1, 300
 """Points for each pixel of the mean silhouette, and for each part, at most: more Gaussians than that learn nothing that
 the images show. Scissors of 3900 pixels from 4000, 5500 or 8000 points have equal errors and pictures, at .75, .9 and 1
 of the seconds; of an arm of 10 parts and 6200 pixels 5500 are too few."""
+ON_SURFACE = 0.5
+"""Share of the points that start on the hull's surface, which plain walls keep to: Gaussians that start behind one show
+its colour from there. Measured on ten objects against none: PSNR +.2 dB, displacements -7 %, Gaussians that stay +8 %;
+with all of them hollows fill up."""
 SLACKS = (0, 2, 4, 6, 9, 13)
 UNCOVERED = 0.005
 """A hull fills silhouettes if it misses no more than this share of them. Of exact cameras it missed none; of cameras
@@ -109,10 +113,19 @@ def visual_hull(views: Sequence[View], resolution: int = 96, slack: int = 0) -> 
     return grid, size
 
 
+def outermost(voxels: Tensor, size: float) -> Tensor:
+    """Which voxels [M] of some with centres [N, 3] do not have all six neighbours."""
+    cell = ((voxels - voxels.amin(0)) / size).round().long() + 1
+    full = torch.zeros((cell.amax(0) + 2).tolist(), dtype=torch.bool)
+    full[cell.unbind(-1)] = True
+    steps = torch.cat([torch.eye(3, dtype=torch.long), -torch.eye(3, dtype=torch.long)])
+    return (~full[(cell[:, None] + steps).unbind(-1)]).any(1).nonzero()[:, 0]
+
+
 def seed_points(
     views: Sequence[View], num_parts: int, count: int, generator: torch.Generator, hull: Hull | None
 ) -> SeedPoints | None:
-    """At most `count` points inside the visual hull, parts below a least number filled up; None without a hull.
+    """At most `count` points in and on the visual hull, parts below a least number filled up; None without a hull.
 
     Every view needs its alpha. Small silhouettes get fewer points. A point's part is the label that most labelled views
     give it, its colour the mean over the views in whose silhouette it falls. The least number keeps small parts from
@@ -131,7 +144,8 @@ def seed_points(
 
     least = next((n for limit, n in MIN_POINTS_PER_PART.items() if num_parts <= limit), MIN_POINTS_OTHERWISE)
     least = min(least, count // num_parts)
-    points = [draw(torch.arange(len(voxels)), count)]
+    on_surface = round(ON_SURFACE * count)
+    points = [draw(outermost(voxels, size), on_surface), draw(torch.arange(len(voxels)), count - on_surface)]
     for part in range(1, num_parts + 1):
         pool = (labels == part).nonzero()[:, 0]
         missing = least - round(count * len(pool) / len(voxels))
