@@ -15,7 +15,7 @@ from torch import Tensor
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.part_pair import PartPair
+from splatart_ns.stages.part_pair import PartPair, PartView
 from splatart_ns.stages.visibility import clearest
 
 AS_CLEARLY = 0.5
@@ -52,8 +52,13 @@ def compared_by_common(pair: PartPair, common: Sequence[Tensor]) -> PartPair:
     pieces = []
     for splat, views, both in zip(pair.splats, pair.views, common, strict=True):
         masked = tuple(replace(view, weight=view.weight * (1 - view.share(splat, ~both))) for view in views)
-        own, left = (sum(float((v.weight * v.rgba[..., 3]).sum()) for v in some) for some in (views, masked))
-        if left < LEAST * own:
+        if not enough_left(views, masked):
             return pair
         pieces.append(masked)
     return replace(pair, views=(pieces[0], pieces[1]))
+
+
+def enough_left(views: Sequence[PartView], masked: Sequence[PartView]) -> bool:
+    """Whether the views with fewer pixels still show a part."""
+    own, left = (sum(float((v.weight * v.rgba[..., 3]).sum()) for v in some) for some in (views, masked))
+    return left >= LEAST * own

@@ -20,6 +20,7 @@ from splatart_ns.capture.view import View, box
 from splatart_ns.geometry.se3 import inverse, matrix_from_quat, transform_points
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.covisibility import enough_left
 from splatart_ns.stages.part_pair import PartPair, best_views
 from splatart_ns.stages.threads import side_by_side
 
@@ -88,9 +89,10 @@ def without_neighbours(view: View, depth: Tensor, part: int) -> View:
 
 
 def in_sight(splat: Splat, views: Sequence[View], depths: Sequence[Tensor], part: int) -> Tensor:
-    """Which Gaussians of a part [N] bool some view shows from end to end.
+    """Which Gaussians of a part [N] bool have both ends in some view.
 
-    The others reach, as nothing kept them from it, into what no view shows, and are seen to when the part moves.
+    The others reach, as nothing kept them from it, into what no view shows, and are seen to when the part moves. An end
+    that a labelled view shows on another part is not in it.
     """
     lengths, order = splat.scales.sort(dim=-1, descending=True)
     axes = matrix_from_quat(F.normalize(splat.quats, dim=-1)).mT.gather(1, order[..., None].expand(-1, -1, 3))
@@ -98,27 +100,30 @@ def in_sight(splat: Splat, views: Sequence[View], depths: Sequence[Tensor], part
     ends = torch.cat([splat.means[:, None] + along, splat.means[:, None] - along], 1)
     seen = torch.zeros(ends.shape[:2], dtype=torch.bool, device=ends.device)
     for view, depth in zip(views, depths, strict=True):
-        if view.labels is None:
-            continue
         x, y, z = transform_points(view.viewmat, ends).unbind(-1)
         z = z.clamp_min(1e-6)
         column = (x / z * view.K[0, 0] + view.K[0, 2]).floor().long()
         row = (y / z * view.K[1, 1] + view.K[1, 2]).floor().long()
         inside = (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
         row, column = row.clamp(0, view.height - 1), column.clamp(0, view.width - 1)
-        label = view.labels[row, column]
-        reached = z <= depth[row, column] + TOLERANCE * (z / view.K[0, 0] + lengths[:, 2:])
-        seen |= inside & reached & ((label == part) | (label == 0))
+        inside &= z <= depth[row, column] + TOLERANCE * (z / view.K[0, 0] + lengths[:, 2:])
+        if view.labels is not None:
+            label = view.labels[row, column]
+            inside &= (label == part) | (label == 0) | (label == UNLABELLED)
+        seen |= inside
     return seen.all(1)
 
 
 def compared_by_seen(pair: PartPair, T: Tensor, seen: Sequence[Tensor]) -> PartPair:
     """The pair without the pixels that show, after the motion T [4, 4], Gaussians that are not `in_sight` in their own
-    state [N] bool each."""
-    views = []
+    state [N] bool each; as it is where hardly any would be left."""
+    pieces = []
     ways = zip(pair.splats, (T, inverse(T)), seen, reversed(pair.views), strict=True)
-    for splat, motion, known, elsewhere in ways:
+    for splat, motion, known, views in ways:
         moved = splat.transformed(motion)
-        clear = [(1 - v.share(moved, ~known) / TRACE).clamp_min(0) for v in elsewhere]
-        views.append(tuple(replace(v, weight=v.weight * c) for v, c in zip(elsewhere, clear, strict=True)))
-    return replace(pair, views=(views[1], views[0]))
+        clear = [(1 - v.share(moved, ~known) / TRACE).clamp_min(0) for v in views]
+        masked = tuple(replace(v, weight=v.weight * c) for v, c in zip(views, clear, strict=True))
+        if not enough_left(views, masked):
+            return pair
+        pieces.append(masked)
+    return replace(pair, views=(pieces[1], pieces[0]))

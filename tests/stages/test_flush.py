@@ -6,7 +6,7 @@ import torch
 from part_scene import angle_deg, box, photograph
 
 from splatart_ns.capture.capture import UNLABELLED
-from splatart_ns.geometry.se3 import from_rotation_translation, so3_exp, transform_points
+from splatart_ns.geometry.se3 import from_rotation_translation, inverse, so3_exp, transform_points
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import pose_evidence
 from splatart_ns.stages.flush import (
@@ -139,6 +139,18 @@ def test_gaussians_that_reach_over_the_border_are_not_in_sight(cupboard, depths)
     assert not seen[face.means[:, 1].abs() > 0.2].any()
 
 
+def test_views_without_labels_show_ends_but_not_whose_they_are(cupboard, depths):
+    splats, views = cupboard
+    face = splats[0].select(splats[0].part_ids == 2)
+    hazy = torch.arange(len(face)) % 8 == 0
+    bare = [replace(v, labels=None) for v in views[0]]
+    silent = [replace(v, labels=torch.full_like(v.labels, UNLABELLED)) for v in views[0]]
+    few = [v if k == shows_best(views[0], 2) else b for k, (v, b) in enumerate(zip(views[0], bare, strict=True))]
+    for some in (bare, silent, few):
+        seen = in_sight(face, some, depths[0], 2)
+        assert not seen[hazy].any() and seen[~hazy].float().mean() > 0.95
+
+
 def test_pixels_that_show_what_was_not_in_sight_do_not_count(cupboard, depths):
     splats, views = cupboard
     pair = part_pair(splats, views, 2, 10, 10**6, near=True)
@@ -153,9 +165,11 @@ def test_pixels_that_show_what_was_not_in_sight_do_not_count(cupboard, depths):
     everything = [torch.ones_like(s) for s in seen]
     for before, after in zip(pair.views[0], compared_by_seen(pair, OPENED, everything).views[0], strict=True):
         torch.testing.assert_close(after.weight, before.weight)
-    nothing = [torch.zeros_like(s) for s in seen]
-    for view in compared_by_seen(pair, OPENED, nothing).views[0]:
-        assert not (view.weight * (view.rgba[..., 3] > 0.95)).any()
+    half = [torch.arange(len(s)) % 2 == 0 for s in seen], [s.means[:, 2] > 0 for s in pair.splats]
+    assert compared_by_seen(pair, OPENED, half[0]) is pair  # hardly a pixel would be left
+    for before, view in zip(pair.views[0], compared_by_seen(pair, OPENED, half[1]).views[0], strict=True):
+        trace = before.share(pair.splats[1].transformed(inverse(OPENED)), ~half[1][1])
+        torch.testing.assert_close(view.weight, before.weight * (1 - trace / TRACE).clamp(0, 1))
 
 
 def test_a_door_that_was_shut_is_found_better(cupboard, monkeypatch):
