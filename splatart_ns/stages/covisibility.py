@@ -52,13 +52,13 @@ def compared_by_common(pair: PartPair, common: Sequence[Tensor]) -> PartPair:
     pieces = []
     for splat, views, both in zip(pair.splats, pair.views, common, strict=True):
         masked = tuple(replace(view, weight=view.weight * (1 - view.share(splat, ~both))) for view in views)
-        if not enough_left(views, masked):
+        if share_left(views, masked) < LEAST:
             return pair
         pieces.append(masked)
     return replace(pair, views=(pieces[0], pieces[1]))
 
 
-def enough_left(views: Sequence[PartView], masked: Sequence[PartView]) -> bool:
-    """Whether the views with fewer pixels still show a part."""
+def share_left(views: Sequence[PartView], masked: Sequence[PartView]) -> float:
+    """The share of a part's pixels that views with smaller weights still count."""
     own, left = (sum(float((v.weight * v.rgba[..., 3]).sum()) for v in some) for some in (views, masked))
-    return left >= LEAST * own
+    return left / own if own > 0 else 0.0

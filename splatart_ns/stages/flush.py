@@ -20,7 +20,7 @@ from splatart_ns.capture.view import View, box
 from splatart_ns.geometry.se3 import inverse, matrix_from_quat, transform_points
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.covisibility import enough_left
+from splatart_ns.stages.covisibility import share_left
 from splatart_ns.stages.part_pair import PartPair, best_views
 from splatart_ns.stages.threads import side_by_side
 
@@ -37,6 +37,8 @@ EXTENT = 2.0
 """How far out a Gaussian must be in sight, in standard deviations."""
 TRACE = 0.1
 """The share of a pixel from which on it does not count, if Gaussians make it up that are not in sight to there."""
+LEAST = 0.1
+"""Where less than this share of a part's pixels is left in both states together, all of them count."""
 
 
 def is_flush(views: Sequence[View], part: int) -> bool:
@@ -122,8 +124,6 @@ def compared_by_seen(pair: PartPair, T: Tensor, seen: Sequence[Tensor]) -> PartP
     for splat, motion, known, views in ways:
         moved = splat.transformed(motion)
         clear = [(1 - v.share(moved, ~known) / TRACE).clamp_min(0) for v in views]
-        masked = tuple(replace(v, weight=v.weight * c) for v, c in zip(views, clear, strict=True))
-        if not enough_left(views, masked):
-            return pair
-        pieces.append(masked)
-    return replace(pair, views=(pieces[1], pieces[0]))
+        pieces.append(tuple(replace(v, weight=v.weight * c) for v, c in zip(views, clear, strict=True)))
+    left = share_left([*pair.views[1], *pair.views[0]], [*pieces[0], *pieces[1]])
+    return pair if left < LEAST else replace(pair, views=(pieces[1], pieces[0]))
