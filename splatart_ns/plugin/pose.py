@@ -33,6 +33,7 @@ from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import InitialMotion, initial_motion
+from splatart_ns.stages.siblings import slid_alike, slide_ways
 from splatart_ns.stages.thinning import BUDGET, MAX_VIEWS, ROUNDS, absences, expendable
 from splatart_ns.stages.unseen import may_have_turned
 from splatart_ns.stages.visibility import HIDDEN, looked_at
@@ -201,17 +202,24 @@ class PosePipeline(VanillaPipeline):
         # Where cameras were refined, each state has kept the mean error of its own: what rests seems to move by that.
         snap = self.config.snap and not self._cameras_refined
         self._reference = reference_states(splats, self._seen, P)
+        motions = {}
         for p, first in enumerate(self._reference):
             for s in range(S):
-                if s == first:
-                    continue
-                pair = [(everything[first], everything[s]) for everything in (splats, self.views, self._seen)]
-                motion = initial_motion(*pair, p + 1, self.config.seed)
-                M[s, p] = motion.T.cpu()
-                self._known[s, p] = motion.found
-                self._frozen[s, p] = not motion.found or (snap and motion.still)
-                self.model.alike[p] |= len(motion.alike) > 0
-                self._note_alike(p, s, motion)
+                if s != first:
+                    pair = [(everything[first], everything[s]) for everything in (splats, self.views, self._seen)]
+                    motions[first, s, p] = initial_motion(*pair, p + 1, self.config.seed)
+        for first, s in {key[:2] for key in motions}:
+            ways = slide_ways([m for key, m in motions.items() if key[:2] == (first, s)])
+            for p in range(P):
+                if (key := (first, s, p)) in motions and motions[key].alike:
+                    pair = [(everything[first], everything[s]) for everything in (splats, self.views)]
+                    motions[key] = slid_alike(*pair, p + 1, motions[key], ways)
+        for (_, s, p), motion in motions.items():
+            M[s, p] = motion.T.cpu()
+            self._known[s, p] = motion.found
+            self._frozen[s, p] = not motion.found or (snap and motion.still)
+            self.model.alike[p] |= len(motion.alike) > 0
+            self._note_alike(p, s, motion)
         return since_state_0(M, self._known)
 
     def _note_alike(self, p: int, s: int, motion: InitialMotion) -> None:

@@ -9,6 +9,7 @@ from nerfstudio.engine.trainer import Trainer
 from splatart_ns.capture.check import require_valid
 from splatart_ns.errors import InputError
 from splatart_ns.method_configs.pose import method as pose_method
+from splatart_ns.stages.render_choice import InitialMotion
 from splatart_ns.stages.thinning import BUDGET, LARGEST_SHARE, ROUNDS
 
 
@@ -81,6 +82,26 @@ def test_gaussians_that_no_view_shows_are_left_out(pose_trainer, monkeypatch):
     monkeypatch.setattr("splatart_ns.plugin.pose.looked_at", last_seen)
     model = pose_trainer(init="centroids").pipeline.model
     assert [len(model.state_splat(state)) for state in (0, 1)] == [1, 1]
+
+
+def test_a_part_in_doubt_is_sought_along_the_ways_of_sure_slides(pose_trainer, monkeypatch):
+    slide, over, better = (torch.eye(4).double() for _ in range(3))
+    slide[1, 3], over[2, 3], better[1, 3] = 0.3, 0.5, 0.2
+    sought = []
+
+    def initial(splats, views, seen, part, seed):
+        return InitialMotion(*((slide, True) if part == 1 else (over, True)), alike=() if part == 1 else (slide,))
+
+    def along(splats, views, part, motion, ways):
+        sought.append((part, ways.tolist()))
+        return InitialMotion(better, found=True)
+
+    monkeypatch.setattr("splatart_ns.plugin.pose.initial_motion", initial)
+    monkeypatch.setattr("splatart_ns.plugin.pose.slid_alike", along)
+    model = pose_trainer().pipeline.model
+    assert sought == [(2, [[0.0, 1.0, 0.0]])]
+    assert torch.equal(model.poses.T()[1], torch.stack([slide, better]))
+    assert not any(model.alike)
 
 
 def test_a_missing_file_is_named(pose_trainer):
