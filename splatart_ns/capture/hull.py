@@ -53,13 +53,7 @@ class Carving:
 
     def surface(self, views: Tensor) -> Tensor:
         """The centres [N, 3] of the outermost of these voxels."""
-        full = self.inside(views)
-        padded = F.pad(full, (1,) * 6)
-        inner = full.clone()
-        for axis in range(3):
-            for step in (-1, 1):
-                inner &= padded.roll(step, axis)[1:-1, 1:-1, 1:-1]
-        return self.points[full & ~inner]
+        return self.points[outermost(self.inside(views))]
 
     def missing(self, view: View, hull: Tensor) -> Tensor:
         """The pixels [H, W] of a view's silhouette that none of the voxels `hull` [N, 3] projects to."""
@@ -143,6 +137,16 @@ def _blame(carving: Carving, views: Tensor) -> Tensor:
     blame = torch.zeros(len(views))
     blame[views] = (rejected[:, near] * (wanted / times[near] ** 2)).sum(1)
     return blame
+
+
+def outermost(full: Tensor) -> Tensor:
+    """Which voxels of those that are `full` [X, Y, Z] bool do not have all six neighbours."""
+    padded = F.pad(full, (1,) * 6)
+    inner = full.clone()
+    for axis in range(3):
+        for step in (-1, 1):
+            inner &= padded.roll(step, axis)[1:-1, 1:-1, 1:-1]
+    return full & ~inner
 
 
 def project(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

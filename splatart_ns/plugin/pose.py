@@ -202,24 +202,23 @@ class PosePipeline(VanillaPipeline):
         # Where cameras were refined, each state has kept the mean error of its own: what rests seems to move by that.
         snap = self.config.snap and not self._cameras_refined
         self._reference = reference_states(splats, self._seen, P)
-        motions = {}
+        found: dict[tuple[int, int], dict[int, InitialMotion]] = {}
         for p, first in enumerate(self._reference):
             for s in range(S):
                 if s != first:
                     pair = [(everything[first], everything[s]) for everything in (splats, self.views, self._seen)]
-                    motions[first, s, p] = initial_motion(*pair, p + 1, self.config.seed)
-        for first, s in {key[:2] for key in motions}:
-            ways = slide_ways([m for key, m in motions.items() if key[:2] == (first, s)])
-            for p in range(P):
-                if (key := (first, s, p)) in motions and motions[key].alike:
+                    found.setdefault((first, s), {})[p] = initial_motion(*pair, p + 1, self.config.seed)
+        for (first, s), motions in found.items():
+            ways = slide_ways(list(motions.values()))
+            for p, motion in motions.items():
+                if motion.alike:
                     pair = [(everything[first], everything[s]) for everything in (splats, self.views)]
-                    motions[key] = slid_alike(*pair, p + 1, motions[key], ways)
-        for (_, s, p), motion in motions.items():
-            M[s, p] = motion.T.cpu()
-            self._known[s, p] = motion.found
-            self._frozen[s, p] = not motion.found or (snap and motion.still)
-            self.model.alike[p] |= len(motion.alike) > 0
-            self._note_alike(p, s, motion)
+                    motion = slid_alike(*pair, p + 1, motion, ways)
+                M[s, p] = motion.T.cpu()
+                self._known[s, p] = motion.found
+                self._frozen[s, p] = not motion.found or (snap and motion.still)
+                self.model.alike[p] |= len(motion.alike) > 0
+                self._note_alike(p, s, motion)
         return since_state_0(M, self._known)
 
     def _note_alike(self, p: int, s: int, motion: InitialMotion) -> None:

@@ -16,13 +16,15 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from splatart_ns.capture.capture import UNLABELLED
+from splatart_ns.capture.hull import project
 from splatart_ns.capture.view import View, box
-from splatart_ns.geometry.se3 import inverse, matrix_from_quat, transform_points
+from splatart_ns.geometry.se3 import inverse, matrix_from_quat
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.covisibility import share_left
 from splatart_ns.stages.part_pair import PartPair, best_views
 from splatart_ns.stages.threads import side_by_side
+from splatart_ns.stages.visibility import MAX_VIEWS
 
 FLUSH = 0.6
 """A part is flush where the images show more than this share of its border against other parts: links of robots have
@@ -31,8 +33,6 @@ REACH = 8
 """Pixels around a part that can say that it is not there."""
 TOLERANCE = 2.0
 """How much nearer another part must be to hide it, in pixels of its own distance."""
-VIEWS = 40
-"""More views than this do not change what share of a border is flush."""
 EXTENT = 2.0
 """How far out a Gaussian must be in sight, in standard deviations."""
 TRACE = 0.1
@@ -44,7 +44,7 @@ LEAST = 0.1
 def is_flush(views: Sequence[View], part: int) -> bool:
     """Whether most of a part's border lies against other parts."""
     against = torch.zeros(2)
-    for view in best_views(views, part, VIEWS):
+    for view in best_views(views, part, MAX_VIEWS):
         if view.labels is None:
             continue
         for labels in (view.labels, view.labels.T):
@@ -102,12 +102,7 @@ def in_sight(splat: Splat, views: Sequence[View], depths: Sequence[Tensor], part
     ends = torch.cat([splat.means[:, None] + along, splat.means[:, None] - along], 1)
     seen = torch.zeros(ends.shape[:2], dtype=torch.bool, device=ends.device)
     for view, depth in zip(views, depths, strict=True):
-        x, y, z = transform_points(view.viewmat, ends).unbind(-1)
-        z = z.clamp_min(1e-6)
-        column = (x / z * view.K[0, 0] + view.K[0, 2]).floor().long()
-        row = (y / z * view.K[1, 1] + view.K[1, 2]).floor().long()
-        inside = (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
-        row, column = row.clamp(0, view.height - 1), column.clamp(0, view.width - 1)
+        column, row, z, inside = project(view, ends)
         inside &= z <= depth[row, column] + TOLERANCE * (z / view.K[0, 0] + lengths[:, 2:])
         if view.labels is not None:
             label = view.labels[row, column]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.capture import UNLABELLED
-from splatart_ns.capture.hull import footprint, project, widened
+from splatart_ns.capture.hull import footprint, outermost, project, widened
 from splatart_ns.capture.view import View
 
 MIN_POINTS_PER_PART = {2: 2000, 6: 1000}
@@ -113,13 +113,12 @@ def visual_hull(views: Sequence[View], resolution: int = 96, slack: int = 0) -> 
     return grid, size
 
 
-def outermost(voxels: Tensor, size: float) -> Tensor:
-    """Which voxels [M] of some with centres [N, 3] do not have all six neighbours."""
-    cell = ((voxels - voxels.amin(0)) / size).round().long() + 1
-    full = torch.zeros((cell.amax(0) + 2).tolist(), dtype=torch.bool)
+def surface(voxels: Tensor, size: float) -> Tensor:
+    """Which of some voxels with centres [N, 3] are their `outermost` [M]."""
+    cell = ((voxels - voxels.amin(0)) / size).round().long()
+    full = torch.zeros((cell.amax(0) + 1).tolist(), dtype=torch.bool)
     full[cell.unbind(-1)] = True
-    steps = torch.cat([torch.eye(3, dtype=torch.long), -torch.eye(3, dtype=torch.long)])
-    return (~full[(cell[:, None] + steps).unbind(-1)]).any(1).nonzero()[:, 0]
+    return outermost(full)[cell.unbind(-1)].nonzero()[:, 0]
 
 
 def seed_points(
@@ -145,7 +144,7 @@ def seed_points(
     least = next((n for limit, n in MIN_POINTS_PER_PART.items() if num_parts <= limit), MIN_POINTS_OTHERWISE)
     least = min(least, count // num_parts)
     on_surface = round(ON_SURFACE * count)
-    points = [draw(outermost(voxels, size), on_surface), draw(torch.arange(len(voxels)), count - on_surface)]
+    points = [draw(surface(voxels, size), on_surface), draw(torch.arange(len(voxels)), count - on_surface)]
     for part in range(1, num_parts + 1):
         pool = (labels == part).nonzero()[:, 0]
         missing = least - round(count * len(pool) / len(voxels))

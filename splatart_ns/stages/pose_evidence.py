@@ -25,6 +25,7 @@ from splatart_ns.stages.visibility import clearest
 ALL_VIEWS = 60
 """Views of each state that the last refinement looks at, where there are so many."""
 MAX_ITERATIONS = 16
+"""Most parts take 1 to 5; a shut door that begins 3 % of the object off took 14."""
 IN_EVEN_LIGHT = {"chroma_weight": CHROMA_WEIGHT, "brightness_weight": 1.0, "even_light": True}
 """How that looks at a `PartPair`."""
 MAYBE_SLIDING = math.radians(10)

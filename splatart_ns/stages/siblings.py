@@ -63,9 +63,10 @@ def slid_alike(
         splats: The labelled splats of the one and the other state.
         views: Their training views.
     """
-    coarse = part_pair(splats, views, part, VIEWS, COARSE_PIXELS)
-    fine = part_pair(splats, views, part, VIEWS, FINE_PIXELS)
-    if coarse is None or fine is None or len(ways) == 0:
+    if len(ways) == 0:
+        return motion
+    coarse, fine = (part_pair(splats, views, part, VIEWS, pixels) for pixels in (COARSE_PIXELS, FINE_PIXELS))
+    if coarse is None or fine is None:
         return motion
     far = coarse.radius * torch.arange(-REACH, REACH + STEP / 2, STEP).to(motion.T)
     slides = torch.eye(4).to(motion.T).repeat(len(ways), len(far), 1, 1)

@@ -10,9 +10,9 @@ from splatart_ns.stages.hull import (
     POINTS_PER_PART,
     POINTS_PER_PIXEL,
     carve,
-    outermost,
     seed_points,
     slack,
+    surface,
     visual_hull,
     vote_by_projection,
 )
@@ -73,22 +73,22 @@ def test_a_small_part_gets_its_least_number_of_points():
 
 def test_the_outermost_voxels_lack_a_neighbour():
     cube = torch.cartesian_prod(*[torch.arange(5)] * 3)
-    full = outermost(0.1 * cube.float() + 0.37, 0.1)
+    full = surface(0.1 * cube.float() + 0.37, 0.1)
     assert len(full) == 5**3 - 3**3 and (cube[full] % 4 == 0).any(1).all()
     hollow = cube[(cube != 2).any(1)]
-    assert len(outermost(0.1 * hollow.float() + 0.37, 0.1)) == 5**3 - 3**3 + 6
-    assert outermost(torch.zeros(1, 3), 0.1).tolist() == [0]
+    assert len(surface(0.1 * hollow.float() + 0.37, 0.1)) == 5**3 - 3**3 + 6
+    assert surface(torch.zeros(1, 3), 0.1).tolist() == [0]
 
 
 def test_half_of_the_points_start_on_the_surface_and_half_anywhere():
     voxels, size = visual_hull(VIEWS, resolution=40)
     silent = [replace(view, labels=None) for view in VIEWS]  # no part is filled up
     points = seed_points(silent, 2, 3000, torch.Generator().manual_seed(0), (voxels, size)).xyz
-    surface = outermost(voxels, size)
+    outer = surface(voxels, size)
     inner = torch.ones(len(voxels), dtype=torch.bool)
-    inner[surface] = False
+    inner[outer] = False
     on_surface = ~inner[torch.cdist(points, voxels).argmin(1)]
-    share = len(surface) / len(voxels)
+    share = len(outer) / len(voxels)
     assert abs(float(on_surface.float().mean()) - (0.5 + 0.5 * share)) < 0.05
 
 
