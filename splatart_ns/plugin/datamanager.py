@@ -91,7 +91,7 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         count, num_parts = self.config.seed_gaussians, len(self.capture.parts)
         points = None
         if state.points is not None:
-            points = SeedPoints(*load_points(state.points, self.capture.normalization, state.placement))
+            points = SeedPoints.without_normals(*load_points(state.points, self.capture.normalization, state.placement))
         views = self.train_dataset.views
         if any(view.alpha is None for view in views):
             outlined = [v for view in views if (v := with_silhouette(view)) is not None]
@@ -109,6 +109,7 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
                     self.train_dataset.metadata["points3D_inside"] = len(points.xyz)
         if points is not None:
             self.train_dataparser_outputs.metadata.update(points3D_xyz=points.xyz, points3D_rgb=points.rgb)
+            self.train_dataset.metadata["points3D_normals"] = points.normals
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """A training frame and its camera: the piece around the object, where the image says which that is.

@@ -56,7 +56,8 @@ class SplatartModel(SplatfactoModel):
         first_camera = metadata["normalization"].camera_to_normal(metadata["frames"][0].T_world_camera)
         self.start_view = StartView(first_camera[:3, 3])
         if self.seed_points is not None and not self.config.random_init:
-            splat = splat_from_points(*self.seed_points, self.config.sh_degree, self.num_parts)
+            normals = metadata.get("points3D_normals", torch.zeros_like(self.seed_points[0]))
+            splat = splat_from_points(*self.seed_points, normals, self.config.sh_degree, self.num_parts)
         else:
             splat = random_splat(
                 self.config.num_random, self.config.random_scale, self.config.sh_degree, self.num_parts

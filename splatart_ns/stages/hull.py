@@ -1,4 +1,4 @@
-"""Where Gaussians start: points in and on the visual hull of the silhouettes, each part with its share."""
+"""Where Gaussians start: on the surface that stereo finds, else in and on the hull of the silhouettes."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.hull import footprint, outermost, project, widened
 from splatart_ns.capture.view import View
+from splatart_ns.stages.stereo import stereo_surface
 
 MIN_POINTS_PER_PART = {2: 2000, 6: 1000}
 """Least number of points of a part, by the number of parts up to which it holds."""
@@ -20,9 +22,10 @@ POINTS_PER_PIXEL, POINTS_PER_PART = 1, 300
 the images show. Scissors of 3900 pixels from 4000, 5500 or 8000 points have equal errors and pictures, at .75, .9 and 1
 of the seconds; of an arm of 10 parts and 6200 pixels 5500 are too few."""
 ON_SURFACE = 0.5
-"""Share of the points that start on the hull's surface, which plain walls keep to: Gaussians that start behind one show
-its colour from there. Measured on ten objects against none: PSNR +.2 dB, displacements -7 %, Gaussians that stay +8 %;
-with all of them hollows fill up."""
+"""Share of the points that start on the hull's surface where stereo finds none at all: plain walls keep to it, but with
+all of them hollows fill up."""
+BESIDE = 2
+"""Voxels around a surface that is found where nothing else starts."""
 SLACKS = (0, 2, 4, 6, 9, 13)
 UNCOVERED = 0.005
 """A hull fills silhouettes if it misses no more than this share of them. Of exact cameras it missed none; of cameras
@@ -41,14 +44,21 @@ class SeedPoints:
     """[N, 3]."""
     rgb: Tensor
     """[N, 3] in 0..255, nerfstudio's convention for seed points."""
+    normals: Tensor
+    """Of the surface they lie on [N, 3]; 0 where it is not known."""
+
+    @classmethod
+    def without_normals(cls, xyz: Tensor, rgb: Tensor) -> SeedPoints:
+        return cls(xyz, rgb, torch.zeros_like(xyz))
 
     def joined(self, other: SeedPoints) -> SeedPoints:
-        return SeedPoints(torch.cat([self.xyz, other.xyz]), torch.cat([self.rgb, other.rgb.to(self.rgb)]))
+        xyz, normals = torch.cat([self.xyz, other.xyz]), torch.cat([self.normals, other.normals])
+        return SeedPoints(xyz, torch.cat([self.rgb, other.rgb.to(self.rgb)]), normals)
 
     def drawn(self, count: int, generator: torch.Generator) -> SeedPoints:
         """At most `count` of the points, drawn at random."""
         chosen = torch.randperm(len(self.xyz), generator=generator)[:count]
-        return SeedPoints(self.xyz[chosen], self.rgb[chosen])
+        return SeedPoints(self.xyz[chosen], self.rgb[chosen], self.normals[chosen])
 
 
 def carve(views: Sequence[View], grid: Tensor, dilate: int) -> Tensor:
@@ -124,34 +134,73 @@ def surface(voxels: Tensor, size: float) -> Tensor:
 def seed_points(
     views: Sequence[View], num_parts: int, count: int, generator: torch.Generator, hull: Hull | None
 ) -> SeedPoints | None:
-    """At most `count` points in and on the visual hull, parts below a least number filled up; None without a hull.
+    """At most `count` points on the surface, and more for parts below a least number; None without a hull.
 
     Every view needs its alpha. Small silhouettes get fewer points. A point's part is the label that most labelled views
-    give it, its colour the mean over the views in whose silhouette it falls. The least number keeps small parts from
-    starving: a finger of a robot would get a dozen points otherwise.
+    give it. The least number keeps small parts from starving: a finger of a robot would get a dozen points otherwise.
     """
     if hull is None:
         return None
-    voxels, size = hull
     pixels = sum(int((view.alpha > 127).sum()) for view in views) / len(views)
     count = min(count, round(POINTS_PER_PIXEL * pixels) + POINTS_PER_PART * num_parts)
-    labels = vote_by_projection(views, voxels, num_parts)
-
-    def draw(pool: Tensor, number: int) -> Tensor:
-        index = pool[torch.randint(len(pool), (number,), generator=generator)]
-        return voxels[index] + size * (torch.rand(number, 3, generator=generator) - 0.5)
-
+    places = _places(views, *hull)
+    labels = vote_by_projection(views, places.xyz, num_parts)
     least = next((n for limit, n in MIN_POINTS_PER_PART.items() if num_parts <= limit), MIN_POINTS_OTHERWISE)
     least = min(least, count // num_parts)
-    on_surface = round(ON_SURFACE * count)
-    points = [draw(surface(voxels, size), on_surface), draw(torch.arange(len(voxels)), count - on_surface)]
+    drawn = [places.weight.multinomial(count, replacement=True, generator=generator)]
     for part in range(1, num_parts + 1):
-        pool = (labels == part).nonzero()[:, 0]
-        missing = least - round(count * len(pool) / len(voxels))
-        if len(pool) > 0 and missing > 0:
-            points.append(draw(pool, missing))
-    xyz = torch.cat(points)
-    return SeedPoints(xyz, _mean_colours(views, xyz))
+        missing = least - int((labels[drawn[0]] == part).sum())
+        if missing > 0 and (labels == part).any():
+            weight = places.weight * (labels == part)
+            drawn.append(weight.multinomial(missing, replacement=True, generator=generator))
+    return places.points(torch.cat(drawn), views, hull[1], generator)
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where points may start: on surfaces, and in voxels of the hull."""
+
+    xyz: Tensor
+    """[N, 3]."""
+    normals: Tensor
+    """Of surfaces; 0 of voxels [N, 3]."""
+    rgb: Tensor
+    """Of surfaces; not a number of voxels [N, 3]."""
+    weight: Tensor
+    """How often each is drawn, compared with the others [N]."""
+
+    def points(self, chosen: Tensor, views: Sequence[View], size: float, generator: torch.Generator) -> SeedPoints:
+        """A point for each place `chosen` [M]: anywhere in a voxel, on a surface as far aside."""
+        normals = self.normals[chosen]
+        aside = size * (torch.rand(len(chosen), 3, generator=generator) - 0.5)
+        xyz = self.xyz[chosen] + aside - (aside * normals).sum(-1, keepdim=True) * normals
+        rgb = torch.where(self.rgb[chosen].isnan(), _mean_colours(views, xyz), self.rgb[chosen])
+        return SeedPoints(xyz, rgb, normals)
+
+
+def _places(views: Sequence[View], voxels: Tensor, size: float) -> _Places:
+    """The surface that stereo finds, each voxel of it alike; where it finds none, the hull less what is free."""
+    found = stereo_surface(views, voxels[surface(voxels, size)], size)
+    low, voxels = voxels.amin(0), voxels[~found.free(voxels, size)]
+    cell = ((voxels - low) / size).round().long()
+    at = ((found.xyz - low) / size).round().long().clamp_min(0)
+    shape = torch.cat([cell, at]).amax(0) + 1
+    full, crowd = torch.zeros(*shape, dtype=torch.bool), torch.zeros(*shape)
+    full[cell.unbind(-1)] = True
+    crowd.index_put_(at.unbind(-1), torch.ones(len(at)), accumulate=True)
+    beside = F.max_pool3d(crowd[None], 2 * BESIDE + 1, stride=1, padding=BESIDE)[0][cell.unbind(-1)] > 0
+    outer = outermost(full)[cell.unbind(-1)] & ~beside
+    unfound = float(outer.sum()) / max(float(outer.sum() + (crowd > 0).sum()), 1.0)
+    within = (1 - ON_SURFACE) * unfound
+    weight = (1 - within) * outer + within * outer.sum() / max(int((~beside).sum()), 1) * ~beside
+    unknown = torch.zeros_like(voxels)
+    return _Places(
+        torch.cat([found.xyz, voxels]),
+        torch.cat([found.normals, unknown]),
+        torch.cat([found.rgb, unknown + torch.nan]),
+        # Beside a surface that is found voxels are for parts that have no other places.
+        torch.cat([1 / crowd[at.unbind(-1)], torch.where(beside, 1e-6, weight)]),
+    )
 
 
 def vote_by_projection(views: Sequence[View], points: Tensor, num_parts: int) -> Tensor:

@@ -52,7 +52,7 @@ def surrounding_points(views: Sequence[View], count: int, generator: torch.Gener
     known = differences.isfinite().sum(0) >= _LEAST_VIEWS
     cost = torch.where(known, differences.nanmedian(0).values, torch.inf)
     best = torch.where(known.any(1), cost.argmin(1), torch.randint(_DEPTHS, (count,), generator=generator))
-    return SeedPoints(points[torch.arange(count), best], colours)
+    return SeedPoints.without_normals(points[torch.arange(count), best], colours)
 
 
 def _blurred(view: View) -> Tensor:

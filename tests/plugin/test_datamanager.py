@@ -78,6 +78,17 @@ def test_seed_points_lie_inside_every_silhouette(capture_dir: Path) -> None:
         assert inside.float().mean() > 0.95
 
 
+def test_normals_come_with_points_on_surfaces(capture_dir: Path, opaque_capture_dir: Path) -> None:
+    pytest.importorskip("numba", reason="stereo is found by numba kernels")
+    for capture in (capture_dir, opaque_capture_dir):
+        manager = manage(capture, seed_gaussians=200)
+        normals = manager.train_dataset.metadata["points3D_normals"]
+        assert normals.shape == manager.train_dataparser_outputs.metadata["points3D_xyz"].shape
+        length = normals.norm(dim=-1)
+        assert ((length == 0) | ((length - 1).abs() < 1e-4)).all()
+        assert (length > 0).any() or capture == opaque_capture_dir
+
+
 @pytest.mark.parametrize("test_mode", ["test", "inference"])
 def test_no_seed_points_where_a_checkpoint_brings_the_gaussians(capture_dir: Path, test_mode: str) -> None:
     assert "points3D_xyz" not in manage(capture_dir, test_mode, seed_gaussians=200).train_dataparser_outputs.metadata

@@ -80,9 +80,10 @@ def test_the_outermost_voxels_lack_a_neighbour():
     assert surface(torch.zeros(1, 3), 0.1).tolist() == [0]
 
 
-def test_half_of_the_points_start_on_the_surface_and_half_anywhere():
+def test_where_stereo_finds_nothing_half_of_the_points_start_on_the_hulls_surface_and_half_anywhere():
     voxels, size = visual_hull(VIEWS, resolution=40)
-    silent = [replace(view, labels=None) for view in VIEWS]  # no part is filled up
+    # Plain, and no part is filled up.
+    silent = [replace(view, rgb=torch.full_like(view.rgb, 99), labels=None) for view in VIEWS]
     points = seed_points(silent, 2, 3000, torch.Generator().manual_seed(0), (voxels, size)).xyz
     outer = surface(voxels, size)
     inner = torch.ones(len(voxels), dtype=torch.bool)

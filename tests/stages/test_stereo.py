@@ -1,0 +1,186 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from part_scene import cameras
+
+from splatart_ns.capture.view import View
+from splatart_ns.stages import stereo
+from splatart_ns.stages.hull import seed_points, surface, visual_hull
+from splatart_ns.stages.stereo import stereo_surface
+
+pytest.importorskip("numba", reason="stereo is found by numba kernels")
+
+FLOOR = (-0.5, -0.4, -0.3), (0.5, 0.4, -0.25)
+WALLS = [
+    ((-0.5, -0.4, -0.3), (-0.45, 0.4, 0.2)),
+    ((0.45, -0.4, -0.3), (0.5, 0.4, 0.2)),
+    ((-0.5, -0.4, -0.3), (0.5, -0.35, 0.2)),
+    ((-0.5, 0.35, -0.3), (0.5, 0.4, 0.2)),
+]
+TRAY = [FLOOR, *WALLS]
+
+
+def photograph(contrast: float, count: int = 32, pixels: int = 128) -> list[View]:
+    """What cameras see of a tray of boxes, cast exactly; its texture has `contrast` grey levels."""
+    K = torch.tensor([[1.8 * pixels, 0, pixels / 2], [0, 1.8 * pixels, pixels / 2], [0, 0, 1]])
+    rows, columns = np.mgrid[:pixels, :pixels] + 0.5
+    rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(K.numpy().astype(float)).T
+    views = []
+    for k, viewmat in enumerate(cameras(count)):
+        R, t = viewmat[:3, :3].double().numpy(), viewmat[:3, 3].double().numpy()
+        eye, direction = -R.T @ t, rays @ R
+        depth = np.full(rows.shape, np.inf)
+        for low, high in TRAY:
+            with np.errstate(divide="ignore"):
+                ends = (np.stack([low, high])[:, None, None] - eye) / direction
+            enter, leave = ends.min(0).max(-1), ends.max(0).min(-1)
+            depth = np.where((enter < leave) & (enter < depth), enter, depth)
+        shown = np.isfinite(depth)
+        x = eye + direction * np.where(shown, depth, 0)[..., None]
+        wave = sum(np.sin(x @ np.array(w)) for w in ((31, 17, 23), (-19, 37, 11), (13, -23, 41))) / 3
+        grey = np.where(shown, np.clip(128 + contrast * wave, 0, 255), 0).round().astype(np.uint8)
+        alpha = torch.from_numpy(255 * shown.astype(np.uint8))
+        rgb = torch.from_numpy(grey)[..., None].repeat(1, 1, 3)
+        views.append(View(f"{k:04d}", viewmat, K, pixels, pixels, rgb, alpha, labels=(alpha > 0).to(torch.uint8)))
+    return views
+
+
+def to_tray(points: torch.Tensor) -> torch.Tensor:
+    """Distance of points [N, 3] to the surface of the tray [N], from either side of it."""
+    low, high = torch.tensor(TRAY).unbind(1)
+    outside = torch.maximum(low - points[:, None], points[:, None] - high)
+    beyond = outside.clamp_min(0).norm(dim=-1)
+    return torch.where(beyond > 0, beyond, -outside.amax(-1)).amin(-1)
+
+
+@pytest.fixture(scope="module")
+def views() -> list[View]:
+    return photograph(40)
+
+
+@pytest.fixture(scope="module")
+def hull(views):
+    return visual_hull(views, resolution=48)
+
+
+def outer(hull):
+    voxels, size = hull
+    return voxels[surface(voxels, size)], size
+
+
+@pytest.fixture(scope="module")
+def found(views, hull):
+    return stereo_surface(views, *outer(hull))
+
+
+def test_points_lie_on_walls_and_on_the_floor_of_a_hollow(found):
+    assert len(found.xyz) > 2000
+    distance = to_tray(found.xyz)
+    assert distance.median() < 0.006 and distance.quantile(0.95) < 0.03
+    on_floor = (found.xyz[:, :2].abs() < 0.3).all(-1) & (found.xyz[:, 2] > -0.28)
+    assert on_floor.sum() > 50  # the hull is 0.4 higher there
+    assert (found.xyz[on_floor, 2] + 0.25).abs().median() < 0.01
+
+
+def test_normals_point_to_who_looks(views, found):
+    assert torch.allclose(found.normals.norm(dim=-1), torch.ones(len(found.normals)), atol=1e-5)
+    assert (found.normals.abs().amax(-1) > math.cos(math.radians(15))).float().mean() > 0.85  # along an axis
+    above = (found.xyz[:, :2].abs() < 0.3).all(-1) & (found.xyz[:, 2] > -0.28)
+    assert (found.normals[above, 2] > 0.9).float().mean() > 0.85
+    below = (found.xyz[:, :2].abs() < 0.3).all(-1) & (found.xyz[:, 2] < -0.28)
+    assert (found.normals[below, 2] < -0.9).float().mean() > 0.85
+
+
+def test_a_hollow_is_free_and_walls_are_not(hull, found):
+    voxels, size = hull
+    free = found.free(voxels, size)
+    in_hollow = (voxels[:, :2].abs() < 0.3).all(-1) & (voxels[:, 2] > -0.15) & (voxels[:, 2] < 0.1)
+    assert in_hollow.sum() > 1000 and free[in_hollow].float().mean() > 0.9
+    assert free[to_tray(voxels) < 0.5 * size].float().mean() < 0.02
+
+
+def test_seed_points_start_on_the_surface_that_is_found(views, hull):
+    points = seed_points(views, 1, 3000, torch.Generator().manual_seed(0), hull)
+    assert to_tray(points.xyz).quantile(0.8) < 0.02
+    on_surface = points.normals.norm(dim=-1) > 0
+    assert on_surface.float().mean() > 0.8
+    assert points.rgb.std() > 5 and points.rgb.isfinite().all()
+    again = seed_points(views, 1, 3000, torch.Generator().manual_seed(0), hull)
+    assert torch.equal(points.xyz, again.xyz)
+
+
+def test_a_part_beside_found_surfaces_gets_its_points(views, hull):
+    """Where only voxels beside a surface show a part."""
+    marked = []
+    for view in views:
+        labels = view.labels.clone()
+        spot = view.K @ (view.viewmat[:3, :3] @ torch.tensor([0.5, 0.0, 0.0]) + view.viewmat[:3, 3])
+        column, row = (spot[:2] / spot[2]).long().tolist()
+        labels[row - 2 : row + 3, column - 2 : column + 3] *= 2
+        marked.append(replace(view, labels=labels))
+    points = seed_points(marked, 2, 1000, torch.Generator().manual_seed(0), hull)
+    near = (points.xyz - torch.tensor([0.5, 0.0, 0.0])).norm(dim=-1) < 0.15
+    assert near.sum() > 300
+
+
+def test_plain_walls_are_not_found(hull):
+    assert len(stereo_surface(photograph(0), *outer(hull)).xyz) == 0
+
+
+def test_faint_textures_are_found(hull, found):
+    faint = stereo_surface(photograph(4), *outer(hull))
+    assert len(faint.xyz) > 0.5 * len(found.xyz)
+    assert to_tray(faint.xyz).median() < 0.01
+
+
+def test_masked_pixels_find_nothing(views, hull):
+    masked = [replace(view, mask=torch.zeros(128, 128, dtype=torch.bool)) for view in views]
+    assert len(stereo_surface(masked, *outer(hull)).xyz) == 0
+    half = torch.arange(128) < 64
+    masked = [replace(view, mask=half.expand(128, 128)) for view in views]
+    assert 0 < len(stereo_surface(masked, *outer(hull)).xyz) < 15_000
+
+
+def test_threads_do_not_change_what_is_found(views, hull, found):
+    threads = torch.get_num_threads()
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            again = stereo_surface(views, *outer(hull))
+            assert torch.equal(again.xyz, found.xyz) and torch.equal(again.normals, found.normals)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_images_of_several_sizes_are_matched(views, hull):
+    half = torch.tensor([[0.5], [0.5], [1.0]])
+    mixed = [
+        replace(v, K=half * v.K, width=64, height=64, rgb=v.rgb[::2, ::2], alpha=v.alpha[::2, ::2]) if i % 2 else v
+        for i, v in enumerate(views)
+    ]
+    surface = stereo_surface(mixed, *outer(hull))
+    assert len(surface.xyz) > 1000 and to_tray(surface.xyz).median() < 0.02
+
+
+@pytest.mark.parametrize("pixels", [1, 2, 4])
+def test_images_of_a_few_pixels_do_no_harm(hull, pixels):
+    found = stereo_surface(photograph(40, pixels=pixels), *outer(hull))
+    assert found.xyz.isfinite().all() and not found.free(hull[0], hull[1]).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_views_find_nothing(views, hull, count):
+    surface = stereo_surface(views[:count], *outer(hull))
+    assert len(surface.xyz) == 0 and not surface.free(hull[0], hull[1]).any()
+
+
+def test_without_numba_points_start_in_and_on_the_hull(views, hull, monkeypatch):
+    monkeypatch.setattr(stereo.importlib.util, "find_spec", lambda name: None)
+    assert len(stereo_surface(views, *outer(hull)).xyz) == 0
+    points = seed_points(views, 1, 1000, torch.Generator().manual_seed(0), hull)
+    assert (points.normals == 0).all() and points.rgb.isfinite().all() and len(points.xyz) >= 1000
+    # The hollow is full of them.
+    assert ((points.xyz[:, :2].abs() < 0.3).all(-1) & (points.xyz[:, 2] > -0.1)).sum() > 50
