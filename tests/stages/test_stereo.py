@@ -8,7 +8,7 @@ from part_scene import cameras
 
 from splatart_ns.capture.view import View
 from splatart_ns.stages import stereo
-from splatart_ns.stages.hull import seed_points, surface, visual_hull
+from splatart_ns.stages.hull import _places, seed_points, surface, visual_hull
 from splatart_ns.stages.stereo import stereo_surface
 
 pytest.importorskip("numba", reason="stereo is found by numba kernels")
@@ -40,8 +40,7 @@ def photograph(contrast: float, count: int = 32, pixels: int = 128) -> list[View
             depth = np.where((enter < leave) & (enter < depth), enter, depth)
         shown = np.isfinite(depth)
         x = eye + direction * np.where(shown, depth, 0)[..., None]
-        wave = sum(np.sin(x @ np.array(w)) for w in ((31, 17, 23), (-19, 37, 11), (13, -23, 41))) / 3
-        grey = np.where(shown, np.clip(128 + contrast * wave, 0, 255), 0).round().astype(np.uint8)
+        grey = np.where(shown, np.clip(128 + contrast * texture(x), 0, 255), 0).round().astype(np.uint8)
         alpha = torch.from_numpy(255 * shown.astype(np.uint8))
         rgb = torch.from_numpy(grey)[..., None].repeat(1, 1, 3)
         views.append(View(f"{k:04d}", viewmat, K, pixels, pixels, rgb, alpha, labels=(alpha > 0).to(torch.uint8)))
@@ -85,6 +84,25 @@ def test_points_lie_on_walls_and_on_the_floor_of_a_hollow(found):
     assert (found.xyz[on_floor, 2] + 0.25).abs().median() < 0.01
 
 
+def texture(points):
+    """Grey of the tray's places [..., 3], less its mean, at contrast 1."""
+    return sum(np.sin(points @ np.array(w)) for w in ((31, 17, 23), (-19, 37, 11), (13, -23, 41))) / 3
+
+
+def test_points_have_the_colour_of_their_place(found):
+    wrong = found.rgb[:, 0] - (128 + 40 * torch.from_numpy(texture(found.xyz.double().numpy())))
+    assert wrong.abs().median() < 5
+
+
+def test_a_depth_that_no_other_view_finds_does_not_count(views, found):
+    others = stereo._others(torch.stack([v.viewmat for v in views]).double(), torch.zeros(3, dtype=torch.float64))
+    depth = found.depth.clone()
+    depth[5] *= 1.1
+    again = stereo._agreed(views, others, depth, torch.zeros(*depth.shape, 3), found.stride)
+    assert again.depth[5].isfinite().sum() < 0.2 * depth[5].isfinite().sum()
+    assert again.depth[9].isfinite().sum() > 0.9 * depth[9].isfinite().sum()
+
+
 def test_normals_point_to_who_looks(views, found):
     assert torch.allclose(found.normals.norm(dim=-1), torch.ones(len(found.normals)), atol=1e-5)
     assert (found.normals.abs().amax(-1) > math.cos(math.radians(15))).float().mean() > 0.85  # along an axis
@@ -102,28 +120,27 @@ def test_a_hollow_is_free_and_walls_are_not(hull, found):
     assert free[to_tray(voxels) < 0.5 * size].float().mean() < 0.02
 
 
-def test_seed_points_start_on_the_surface_that_is_found(views, hull):
+def test_seed_points_start_on_the_surface_that_is_found(views, hull, found):
     points = seed_points(views, 1, 3000, torch.Generator().manual_seed(0), hull)
     assert to_tray(points.xyz).quantile(0.8) < 0.02
     on_surface = points.normals.norm(dim=-1) > 0
     assert on_surface.float().mean() > 0.8
     assert points.rgb.std() > 5 and points.rgb.isfinite().all()
+    # Beside a place that was found, but not before or behind it.
+    xyz, normals = points.xyz[on_surface], points.normals[on_surface]
+    same = (normals[:200, None] == found.normals).all(-1)
+    off = ((xyz[:200, None] - found.xyz) * normals[:200, None]).sum(-1).abs().where(same, torch.tensor(torch.inf))
+    assert off.amin(1).max() < 1e-5 and torch.cdist(xyz[:200], found.xyz).amin(1).max() > 1e-4
     again = seed_points(views, 1, 3000, torch.Generator().manual_seed(0), hull)
     assert torch.equal(points.xyz, again.xyz)
 
 
-def test_a_part_beside_found_surfaces_gets_its_points(views, hull):
-    """Where only voxels beside a surface show a part."""
-    marked = []
-    for view in views:
-        labels = view.labels.clone()
-        spot = view.K @ (view.viewmat[:3, :3] @ torch.tensor([0.5, 0.0, 0.0]) + view.viewmat[:3, 3])
-        column, row = (spot[:2] / spot[2]).long().tolist()
-        labels[row - 2 : row + 3, column - 2 : column + 3] *= 2
-        marked.append(replace(view, labels=labels))
-    points = seed_points(marked, 2, 1000, torch.Generator().manual_seed(0), hull)
-    near = (points.xyz - torch.tensor([0.5, 0.0, 0.0])).norm(dim=-1) < 0.15
-    assert near.sum() > 300
+def test_every_voxel_is_left_to_parts_that_have_no_other_places(views, hull):
+    places = _places(views, *hull)
+    voxel = places.rgb.isnan().all(-1)
+    assert (places.weight > 0).all()
+    beside = voxel & (to_tray(places.xyz) < hull[1])
+    assert places.weight[beside].median() <= 1e-5 < places.weight[~voxel].min()
 
 
 def test_plain_walls_are_not_found(hull):
