@@ -43,7 +43,11 @@ body both."""
 _STACKED_ALIKE = 0.1
 """That of a slide on a part that slides on the root itself, both along the way the child slides on the root, and of a
 hinge whose axis its parent and the child itself turn about on the root, as doors above each other do. It says nothing
-that the other two do not, and a drawer shows where it nears its neighbour but not where it touches the body."""
+that the other two do not, and a drawer shows where it nears its neighbour but not where it touches the body. And that
+of a part that is nearly fixed to such a one, but not quite: both moved by about as much."""
+_NOT_QUITE = 0.004
+"""Least residual of such a fixed joint, as a share of the object's radius: a handle's on its door is as small as the
+errors of poses are."""
 _PARALLEL = 0.98
 """Least cosine of the angle between slides along one way, and hinges about one line."""
 _ONE_LINE = 0.1
@@ -239,6 +243,8 @@ def _stacked(
     fits = [joints.get(edge) for edge in ((parent, child), (root, parent), (root, child))]
     if any(fit is None or not fit.accepted for fit in fits):
         return _STACKED
+    if fits[0].type == "fixed" and fits[0].residual > _NOT_QUITE * object_radius:
+        fits = fits[1:]
     kinds = {fit.type for fit in fits}
     if kinds not in ({"prismatic"}, {"revolute"}):
         return _STACKED
@@ -247,7 +253,7 @@ def _stacked(
         return _STACKED
     if kinds == {"revolute"}:
         origins = torch.stack([fit.origin for fit in fits])
-        apart = torch.linalg.cross(origins[:, None] - origins, axes.expand(3, 3, 3)).norm(dim=-1)
+        apart = torch.linalg.cross(origins[:, None] - origins, axes.expand(len(fits), -1, -1)).norm(dim=-1)
         if bool((apart > _ONE_LINE * object_radius).any()):
             return _STACKED
     return _STACKED_ALIKE

@@ -524,6 +524,22 @@ def test_between_nearly_equal_parents_the_root_wins(kind, apart, closer, parent)
     assert {j.child: j.parent for j in tree.joints} == {2: 1, 3: parent}
 
 
+@pytest.mark.parametrize("kind", ["prismatic", "revolute"])
+@pytest.mark.parametrize("residual, parent", [(0.006, 1), (0.002, 2)], ids=["nearly fixed", "fixed"])
+def test_of_two_that_moved_nearly_alike_none_hangs_on_the_other_but_a_handle_does(kind, residual, parent):
+    def move(value):
+        return JointFit(kind, X, 0 * X, 0.0, torch.tensor([0.0, value]).double(), residual=0.0)
+
+    fixed = JointFit("fixed", 0 * X, 0 * X, 0.0, torch.zeros(2).double(), residual=residual)
+    joints = {(1, 2): move(0.2), (1, 3): move(0.21), (2, 3): fixed}
+    joints |= {(b, a): fit for (a, b), fit in joints.items()}
+    on_axis = torch.zeros(2, 3).double()
+    gaps = {(1, 2): 0.02, (1, 3): 0.09, (2, 3): 0.03}
+    contacts = {pair: Contact(gap, on_axis, (on_axis, on_axis)) for pair, gap in gaps.items()}
+    tree = build_tree([1, 2, 3], joints, contacts, 1, 1.0)
+    assert {j.child: j.parent for j in tree.joints} == {2: 1, 3: parent}
+
+
 def test_knobs_beside_each_other_hang_on_the_panel_behind_them():
     """Only their faces are seen, and the panel not behind them; the relative motion turns about a line between them."""
     centres = {2: torch.tensor([-0.17, 0, 0.06]).double(), 3: torch.tensor([0.17, 0, 0.06]).double()}
