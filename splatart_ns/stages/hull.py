@@ -181,7 +181,8 @@ class _Places:
 def _places(views: Sequence[View], voxels: Tensor, size: float) -> _Places:
     """The surface that stereo finds, each voxel of it alike; where it finds none, the hull less what is free."""
     found = stereo_surface(views, voxels[surface(voxels, size)], size)
-    low, voxels = voxels.amin(0), voxels[~found.free(voxels, size)]
+    free, blank = found.judged(voxels, size)
+    low, voxels, blank = voxels.amin(0), voxels[~free], blank[~free]
     cell = ((voxels - low) / size).round().long()
     at = ((found.xyz - low) / size).round().long().clamp_min(0)
     shape = torch.cat([cell, at]).amax(0) + 1
@@ -189,8 +190,9 @@ def _places(views: Sequence[View], voxels: Tensor, size: float) -> _Places:
     full[cell.unbind(-1)] = True
     crowd.index_put_(at.unbind(-1), torch.ones(len(at)), accumulate=True)
     beside = F.max_pool3d(crowd[None], 2 * BESIDE + 1, stride=1, padding=BESIDE)[0][cell.unbind(-1)] > 0
-    outer = outermost(full)[cell.unbind(-1)] & ~beside
-    unfound = float(outer.sum()) / max(float(outer.sum() + (crowd > 0).sum()), 1.0)
+    # A surface would be found, but in views that cannot see it, or not match it: these are few where it is not.
+    outer = blank * (outermost(full)[cell.unbind(-1)] & ~beside)
+    unfound = outer.sum() / (outer.sum() + (crowd > 0).sum()).clamp_min(1e-6)
     within = (1 - ON_SURFACE) * unfound
     weight = (1 - within) * outer + within * outer.sum() / max(int((~beside).sum()), 1) * ~beside
     unknown = torch.zeros_like(voxels)

@@ -56,17 +56,20 @@ class StereoSurface:
     stride: int
     """Side of a cell, pixels."""
 
-    def free(self, points: Tensor, size: float) -> Tensor:
-        """Which of some points [N, 3] lie before surfaces, by twice a `size` and more: [N] bool.
+    def judged(self, points: Tensor, size: float) -> tuple[Tensor, Tensor]:
+        """Which of some points [N, 3] lie before surfaces, by twice a `size` and more: [N] bool; and in which share of
+        the views nothing is found where they are [N].
 
-        Views look past a rim: a surface counts where it fills all cells around.
+        Views look past a rim: a surface is behind a point where it fills all cells around.
         """
-        times = torch.zeros(len(points), dtype=torch.long)
+        looking, blank, before = torch.zeros(3, len(points))
         for view, depth in zip(self.views, self.depth, strict=True):
             row, column, z, inside = _cells(view, points, self.stride)
             near, far = -F.max_pool2d(-depth[None], 3, stride=1, padding=1)[0], F.max_pool2d(depth[None], 3, 1, 1)[0]
-            times += inside & far.isfinite()[row, column] & (z < near[row, column] - _IN_FRONT * size)
-        return times >= _FREED_BY
+            looking += inside
+            blank += inside & depth.isinf()[row, column]
+            before += inside & far.isfinite()[row, column] & (z < near[row, column] - _IN_FRONT * size)
+        return before >= _FREED_BY, torch.where(looking > 0, blank / looking, 1.0)
 
 
 def stereo_surface(views: Sequence[View], voxels: Tensor, size: float) -> StereoSurface:

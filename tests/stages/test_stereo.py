@@ -114,10 +114,11 @@ def test_normals_point_to_who_looks(views, found):
 
 def test_a_hollow_is_free_and_walls_are_not(hull, found):
     voxels, size = hull
-    free = found.free(voxels, size)
+    free, blank = found.judged(voxels, size)
     in_hollow = (voxels[:, :2].abs() < 0.3).all(-1) & (voxels[:, 2] > -0.15) & (voxels[:, 2] < 0.1)
     assert in_hollow.sum() > 1000 and free[in_hollow].float().mean() > 0.9
     assert free[to_tray(voxels) < 0.5 * size].float().mean() < 0.02
+    assert blank.median() < 0.2
 
 
 def test_seed_points_start_on_the_surface_that_is_found(views, hull, found):
@@ -185,13 +186,14 @@ def test_images_of_several_sizes_are_matched(views, hull):
 @pytest.mark.parametrize("pixels", [1, 2, 4])
 def test_images_of_a_few_pixels_do_no_harm(hull, pixels):
     found = stereo_surface(photograph(40, pixels=pixels), *outer(hull))
-    assert found.xyz.isfinite().all() and not found.free(hull[0], hull[1]).all()
+    assert found.xyz.isfinite().all() and not found.judged(*hull)[0].all()
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_views_find_nothing(views, hull, count):
     surface = stereo_surface(views[:count], *outer(hull))
-    assert len(surface.xyz) == 0 and not surface.free(hull[0], hull[1]).any()
+    assert len(surface.xyz) == 0 and not surface.judged(*hull)[0].any()
+    assert (surface.judged(*hull)[1] == 1).all()
 
 
 def test_without_numba_points_start_in_and_on_the_hull(views, hull, monkeypatch):
