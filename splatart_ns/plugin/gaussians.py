@@ -10,7 +10,8 @@ from splatart_ns.geometry.spherical_harmonics import SH_C0
 from splatart_ns.splats.splat import Splat
 
 FLATNESS = 0.3
-"""How thick Gaussians on a known surface start, in their widths: .2 and .5 gave the same pictures and errors."""
+"""How thick Gaussians on a known surface start, in their widths. On one object .2 and .5 gave equal pictures, and round
+ones .3 dB less."""
 
 
 def gauss_params_from_splat(splat: Splat) -> dict[str, nn.Parameter]:

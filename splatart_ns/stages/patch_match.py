@@ -16,7 +16,7 @@ REACH, SKIP = 4, 2
 """A patch's pixels: every `SKIP`-th up to `REACH` from its centre."""
 PATCH = (2 * REACH // SKIP + 1) ** 2
 BEST = 3
-"""A place is seen by three other views at least that are near; the rest of them may have it hidden."""
+"""So many of the other views are taken to see a place; the rest may have it hidden."""
 HIDDEN = 65535
 """Stands for the brightness of a pixel that does not show the object."""
 _NOISE = 9.0
