@@ -31,7 +31,7 @@ def set_backend(backend: Backend) -> None:
     global _chosen
     if backend not in get_args(Backend):
         raise InputError(f"There is no rasterizer {backend!r}: take one of {', '.join(get_args(Backend))}.")
-    if backend == "numba" and not _has_numba():
+    if backend == "numba" and not has_numba():
         raise InputError("The numba rasterizer needs numba: pip install 'splatart-ns[cpu]', or take the torch one.")
     if backend == "gsplat" and not torch.cuda.is_available():
         raise InputError("The gsplat rasterizer needs CUDA, which torch does not find: take auto, numba or torch.")
@@ -46,11 +46,12 @@ def default_backend(device_type: str | None = None) -> Backend:
         device_type = "cuda" if torch.cuda.is_available() else "cpu"
     if device_type == "cuda":
         return "gsplat"
-    return "numba" if device_type == "cpu" and _has_numba() else "torch"
+    return "numba" if device_type == "cpu" and has_numba() else "torch"
 
 
 @functools.cache
-def _has_numba() -> bool:
+def has_numba() -> bool:
+    """Whether kernels can be compiled."""
     return importlib.util.find_spec("numba") is not None
 
 

@@ -6,16 +6,16 @@ and covariance under a Gaussian window (11 taps, sigma 1.5), only where the wind
 
 from __future__ import annotations
 
-import importlib.util
 from functools import cache
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from splatart_ns.rasterize.rasterization import has_numba
+
 _TAPS, _SIGMA = 11, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
-_HAS_NUMBA = importlib.util.find_spec("numba") is not None
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -40,7 +40,7 @@ class _Similarity(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, target, l1_factor, ssim_factor):
         function = _value_and_gradient
-        if _HAS_NUMBA and image.device.type == "cpu" and image.dtype == torch.float32:
+        if has_numba() and image.device.type == "cpu" and image.dtype == torch.float32:
             function = _value_and_gradient_numba
         with_gradient = ctx.needs_input_grad[0]
         value, gradient = function(image.detach(), target.detach().to(image), l1_factor, ssim_factor, with_gradient)

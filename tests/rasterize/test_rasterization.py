@@ -138,7 +138,7 @@ def test_unsupported_arguments_are_named():
 
 @pytest.mark.parametrize("has_numba, expected", [(False, "torch"), (True, "numba")])
 def test_backends_are_chosen_by_device(monkeypatch, has_numba, expected):
-    monkeypatch.setattr(MODULE, "_has_numba", lambda: has_numba)
+    monkeypatch.setattr(MODULE, "has_numba", lambda: has_numba)
     assert [default_backend(d) for d in ("cuda", "cpu", "xpu")] == ["gsplat", expected, "torch"]
 
 
@@ -150,7 +150,7 @@ def test_the_backend_can_be_chosen_for_the_process(monkeypatch):
     assert default_backend("cuda") == "gsplat"
     with pytest.raises(InputError, match="tensorflow"):
         set_backend("tensorflow")
-    monkeypatch.setattr(MODULE, "_has_numba", lambda: False)
+    monkeypatch.setattr(MODULE, "has_numba", lambda: False)
     with pytest.raises(InputError, match="pip install"):
         set_backend("numba")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)

@@ -197,7 +197,7 @@ def test_few_views_find_nothing(views, hull, count):
 
 
 def test_without_numba_points_start_in_and_on_the_hull(views, hull, monkeypatch):
-    monkeypatch.setattr(stereo.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(stereo, "has_numba", lambda: False)
     assert len(stereo_surface(views, *outer(hull)).xyz) == 0
     points = seed_points(views, 1, 1000, torch.Generator().manual_seed(0), hull)
     assert (points.normals == 0).all() and points.rgb.isfinite().all() and len(points.xyz) >= 1000
