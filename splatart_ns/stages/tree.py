@@ -44,7 +44,8 @@ _STACKED_ALIKE = 0.1
 """That of a slide on a part that slides on the root itself, both along the way the child slides on the root, and of a
 hinge whose axis its parent and the child itself turn about on the root, as doors above each other do. It says nothing
 that the other two do not, and a drawer shows where it nears its neighbour but not where it touches the body. And that
-of a part that is nearly fixed to such a one, but not quite: both moved by about as much."""
+of a part that is nearly fixed to such a one, but not quite: both moved by about as much. And that of a slide between
+two parts that turn about parallel lines on the root: from one state to another by the same angle."""
 _NOT_QUITE = 0.004
 """Least residual of such a fixed joint, as a share of the object's radius: a handle's on its door is as small as the
 errors of poses are."""
@@ -243,15 +244,18 @@ def _stacked(
     fits = [joints.get(edge) for edge in ((parent, child), (root, parent), (root, child))]
     if any(fit is None or not fit.accepted for fit in fits):
         return _STACKED
-    if fits[0].type == "fixed" and fits[0].residual > _NOT_QUITE * object_radius:
-        fits = fits[1:]
+    between, *on_root = fits
+    not_quite_fixed = between.type == "fixed" and between.residual > _NOT_QUITE * object_radius
+    by_one_angle = between.type == "prismatic" and {fit.type for fit in on_root} == {"revolute"}
+    if not_quite_fixed or by_one_angle:
+        fits = on_root
     kinds = {fit.type for fit in fits}
     if kinds not in ({"prismatic"}, {"revolute"}):
         return _STACKED
     axes = torch.stack([fit.axis for fit in fits])
     if not bool(((axes @ axes.T).abs() > _PARALLEL).all()):
         return _STACKED
-    if kinds == {"revolute"}:
+    if kinds == {"revolute"} and not by_one_angle:
         origins = torch.stack([fit.origin for fit in fits])
         apart = torch.linalg.cross(origins[:, None] - origins, axes.expand(len(fits), -1, -1)).norm(dim=-1)
         if bool((apart > _ONE_LINE * object_radius).any()):

@@ -540,6 +540,26 @@ def test_of_two_that_moved_nearly_alike_none_hangs_on_the_other_but_a_handle_doe
     assert {j.child: j.parent for j in tree.joints} == {2: 1, 3: parent}
 
 
+@pytest.mark.parametrize(
+    "axis, closer, parent",
+    [(Y, 0.07, 1), (Y, 0.15, 2), (Z, 0.07, 2)],
+    ids=["parallel", "parallel, much closer", "not parallel"],
+)
+def test_of_two_doors_that_turned_by_one_angle_none_slides_on_the_other(axis, closer, parent):
+    turn = torch.tensor([0.0, 0.4]).double()
+    joints = {
+        (1, 2): JointFit("revolute", Y, 0 * X, 0.0, turn, residual=0.0),
+        (1, 3): JointFit("revolute", axis, 0.3 * Z, 0.0, turn, residual=0.0),
+        (2, 3): JointFit("prismatic", X, 0 * X, 0.0, 0.3 * turn, residual=0.0),
+    }
+    joints |= {(b, a): fit for (a, b), fit in joints.items()}
+    on_both = torch.stack([0 * Z, 0.3 * Z])
+    gaps = {(1, 2): 0.02, (1, 3): 0.16, (2, 3): 0.16 - closer}
+    contacts = {pair: Contact(gap, on_both, (on_both, on_both)) for pair, gap in gaps.items()}
+    tree = build_tree([1, 2, 3], joints, contacts, 1, 1.0)
+    assert {j.child: j.parent for j in tree.joints} == {2: 1, 3: parent}
+
+
 def test_knobs_beside_each_other_hang_on_the_panel_behind_them():
     """Only their faces are seen, and the panel not behind them; the relative motion turns about a line between them."""
     centres = {2: torch.tensor([-0.17, 0, 0.06]).double(), 3: torch.tensor([0.17, 0, 0.06]).double()}
