@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -17,7 +16,7 @@ import trimesh
 from splatart_ns.bundle.bundle import Bundle, Joint
 from splatart_ns.bundle.dataset import Dataset, Sample
 from splatart_ns.bundle.posing import configured_motions
-from splatart_ns.capture.images import write_png
+from splatart_ns.capture.images import depth_unit, write_depth, write_png
 from splatart_ns.errors import InputError
 from splatart_ns.files import replacing, write_json
 from splatart_ns.records import read_record
@@ -91,10 +90,9 @@ def _fingerprint(bundle: Bundle) -> str:
 
 
 def _depth_unit(dataset: Dataset) -> float:
-    """The length of one count of a depth image: the power of ten with which twice the farthest depth has 16 bits."""
     camera = dataset.camera(0)
     distance = float(np.linalg.norm(camera.T_world_camera[:3, 3].numpy() - dataset.centre))
-    return 10.0 ** math.ceil(math.log10(2 * (distance + dataset.radius) / 65535))
+    return depth_unit(distance + dataset.radius)
 
 
 def _name(index: int, states: int) -> str:
@@ -105,12 +103,11 @@ def _image(folder: Path, index: int, states: int) -> Path:
     return folder / f"state_{index % states:02d}" / "images" / _name(index, states)
 
 
-def _write_sample(sample: Sample, folder: Path, states: int, depth_unit: float) -> None:
+def _write_sample(sample: Sample, folder: Path, states: int, unit: float) -> None:
     """The image comes last: where it is, all is."""
     image = _image(folder, sample.index, states)
     state = image.parents[1]
-    counts = (sample.depth / depth_unit).round().clip(0, 65535).astype(np.uint16)
-    write_png(state / "depth" / image.name, counts)
+    write_depth(state / "depth" / image.name, sample.depth, unit)
     write_png(state / "semantics" / image.name, sample.labels)
     write_png(image, cv2.cvtColor(sample.rgba, cv2.COLOR_RGBA2BGRA))
 

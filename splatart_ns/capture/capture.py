@@ -100,6 +100,9 @@ class Frame:
     mask: Path | None = None
     """Pixels that count in the loss."""
     depth: Path | None = None
+    """Along the optical axis, in counts of `depth_unit`; 0 where unknown."""
+    depth_unit: float = 1e-3
+    """In the capture's length unit."""
 
 
 @dataclass(frozen=True)

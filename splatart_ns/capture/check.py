@@ -12,7 +12,7 @@ import numpy as np
 
 from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame, Normalization, Problem, State
 from splatart_ns.capture.formats import read_capture
-from splatart_ns.capture.images import read_depth, read_image, read_labels, read_mask, read_sized
+from splatart_ns.capture.images import read_depth_for, read_image, read_labels, read_mask, read_sized
 from splatart_ns.capture.view import load_points
 from splatart_ns.errors import InputError
 
@@ -93,7 +93,11 @@ def _look(frame: Frame, parts: dict[int, str]) -> _Content:
     if mask is not None and not mask.any():
         message, mend = "the mask leaves no pixel to the loss", "white must be what counts; or take the frame out"
         content.problems.append(Problem("warning", frame.mask, message, mend))
-    read(frame.depth, read_depth)
+    if frame.depth is not None and image is not None:  # which has the camera's size, and so a bearable one
+        try:
+            read_depth_for(frame.depth, frame.camera)
+        except CaptureError as error:
+            content.problems.append(error.problem)
     labels = read(frame.labels, read_labels)
     if labels is not None:
         content.pixels = np.bincount(labels.ravel(), minlength=256)

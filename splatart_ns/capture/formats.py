@@ -28,6 +28,7 @@ from splatart_ns.capture.values import (
     parse_camera,
     parse_matrix,
     parse_pose,
+    parse_positive,
     read_inner_json,
     relative_path,
     show,
@@ -281,6 +282,7 @@ def _frame(file: Path, root: Path, name: str, meta: dict[str, Any], entry: dict[
         return None if value is None else inner_path(file, root, f"{key} of {owner}", value)
 
     image = inner_path(file, root, f"file_path of {owner}", name)
+    unit = entry.get("depth_unit_scale_factor", meta.get("depth_unit_scale_factor", Frame.depth_unit))
     return Frame(
         name=name,
         image=image,
@@ -291,6 +293,7 @@ def _frame(file: Path, root: Path, name: str, meta: dict[str, Any], entry: dict[
         object_mask=optional("object_mask_path"),
         mask=optional("mask_path"),
         depth=optional("depth_file_path"),
+        depth_unit=parse_positive(file, f"depth_unit_scale_factor of {owner}", unit),
     )
 
 

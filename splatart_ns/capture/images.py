@@ -6,6 +6,7 @@ All readers raise `InputError` when the file is missing, damaged or not of the k
 from __future__ import annotations
 
 import io
+import math
 import os
 import struct
 from collections.abc import Callable
@@ -100,6 +101,16 @@ def read_depth(path: Path, unit: float = 1e-3) -> np.ndarray:
     return np.nan_to_num(depth.astype(np.float32) * np.float32(unit), nan=0.0, posinf=0.0, neginf=0.0)
 
 
+def depth_unit(farthest: float) -> float:
+    """The length of one count of a depth image: the power of ten with which twice the farthest depth has 16 bits."""
+    return 10.0 ** math.ceil(math.log10(2 * farthest / 65535))
+
+
+def write_depth(path: Path, depth: np.ndarray, unit: float) -> None:
+    """Write depth [H, W] as 16 bits, in counts of `unit`."""
+    write_png(path, (depth / unit).round().clip(0, 65535).astype(np.uint16))
+
+
 def write_png(path: Path, image: np.ndarray) -> None:
     """Write grey, BGR or BGRA pixels (uint8 or uint16), making the folder where it is missing."""
     with replacing(path) as temporary:
@@ -118,6 +129,20 @@ def read_sized(path: Path, reader: Callable[[Path], np.ndarray], camera: Camera)
             "resize the file, or correct w, h and the intrinsics",
         )
     return array
+
+
+def read_depth_for(path: Path, camera: Camera, unit: float = 1e-3) -> np.ndarray:
+    """`read_depth` for a camera: sensors of depth have fewer pixels, of which each takes the nearest, as nerfstudio."""
+    depth = read_depth(path, unit)
+    height, width = depth.shape
+    uneven = abs(width * camera.height - height * camera.width) > max(camera.height, camera.width)
+    if uneven or depth.size == 0:
+        raise CaptureError(
+            path,
+            f"the depth is {width}x{height} pixels, and not a smaller {camera.width}x{camera.height} as its camera",
+            "cut the file to what the image shows",
+        )
+    return cv2.resize(depth, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -159,12 +184,12 @@ def undistort(image: np.ndarray, camera: Camera) -> np.ndarray:
     return _filter(image, lambda x: cv2.remap(x, u, v, cv2.INTER_LINEAR))
 
 
-def undistort_labels(labels: np.ndarray, camera: Camera) -> np.ndarray:
-    """Labels [H, W] as `undistorted_camera(camera)` sees them, by the nearest pixel; 255 where no pixel is."""
+def undistort_labels(labels: np.ndarray, camera: Camera, unknown: int = UNLABELLED) -> np.ndarray:
+    """Labels or depths [H, W] as `undistorted_camera(camera)` sees them, by the nearest pixel, or `unknown`."""
     if not camera.distorted:
         return labels
     u, v = _distorted_pixels(camera)
-    return cv2.remap(labels, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, UNLABELLED)
+    return cv2.remap(labels, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, unknown)
 
 
 def undistorted_points(pixels: np.ndarray, camera: Camera) -> np.ndarray:
@@ -186,7 +211,7 @@ def downscale(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def downscale_labels(labels: np.ndarray, factor: int) -> np.ndarray:
-    """The label in the middle of each block of factor x factor pixels; ids are never mixed."""
+    """The label, or depth, in the middle of each block of factor x factor pixels; they are never mixed."""
     h, w = labels.shape[0] // factor, labels.shape[1] // factor
     return np.ascontiguousarray(labels[factor // 2 :: factor, factor // 2 :: factor][:h, :w])
 

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 
 from splatart_ns.capture.capture import Camera
-from splatart_ns.capture.images import write_png
+from splatart_ns.capture.images import depth_unit, write_depth, write_png
 from splatart_ns.capture.ray_caster import RayCaster
 from splatart_ns.capture.robot import Joint, Robot, read_urdf
 from splatart_ns.capture.scene import Scene, camera_poses, ground_truth
@@ -157,7 +157,8 @@ def _write_state(
         [camera_poses(n, scene.centre, distance, options.views, rng) for n in (train_views, options.test_views)]
     )
     labelled = set(rng.permutation(train_views)[: round(options.labelled_fraction * train_views)].tolist())
-    for name in ("images", "semantics", "masks"):
+    unit = depth_unit(distance + scene.radius)
+    for name in ("images", "semantics", "masks", *["depth"] * options.depth):
         (folder / name).mkdir(parents=True)
 
     caster, frames = RayCaster(scene.placed(values)), []
@@ -170,6 +171,9 @@ def _write_state(
             write_png(folder / "semantics" / name, seen.part_ids)
             frame["semantics_path"] = f"semantics/{name}"
         write_png(folder / "masks" / name, seen.silhouette.astype(np.uint8) * 255)
+        if options.depth:
+            write_depth(folder / "depth" / name, seen.depth, unit)
+            frame["depth_file_path"] = f"depth/{name}"
         frames.append({**frame, "transform_matrix": T.tolist(), "object_mask_path": f"masks/{name}"})
 
     train, test = [f["file_path"] for f in frames[:train_views]], [f["file_path"] for f in frames[train_views:]]
@@ -183,6 +187,7 @@ def _write_state(
         "cy": 0.5 * size,
         **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
         "length_unit": options.length_unit,
+        **({"depth_unit_scale_factor": unit} if options.depth else {}),
         "semantic_classes": ["background", *scene.ids],
         "train_filenames": train,
         "val_filenames": test,

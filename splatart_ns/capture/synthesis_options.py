@@ -35,6 +35,8 @@ class SynthesisOptions:
     """Field of view across an image."""
     labelled_fraction: float = 1.0
     """Share of the training views of a state that come with part labels, 0 to 1; test views always do."""
+    depth: bool = False
+    """Whether images come with their depth, as of a sensor without errors."""
     samples: int = 2
     """Rays per pixel along each side, against jagged edges."""
     light: Light = field(default_factory=Light)

@@ -102,6 +102,13 @@ def parse_number(file: Path, what: str, value: Any) -> float:
     return float(value)
 
 
+def parse_positive(file: Path, what: str, value: Any) -> float:
+    number = parse_number(file, what, value)
+    if number <= 0:
+        raise CaptureError(file, f"{what} is {number:g}", "it must be positive")
+    return number
+
+
 def parse_matrix(file: Path, what: str, value: Any, shapes: Sequence[tuple[int, int]]) -> np.ndarray:
     if isinstance(value, list) and all(isinstance(row, list) for row in value):
         rows = [[parse_number(file, f"an entry of {what}", x) for x in row] for row in value]
@@ -123,10 +130,8 @@ def parse_camera(file: Path, owner: str, values: dict[str, Any], image: Path) ->
         return None if value is None else parse_number(file, f"{key} of {owner}", value)
 
     def positive(key: str) -> float | None:
-        value = number(key)
-        if value is not None and value <= 0:
-            raise CaptureError(file, f"{key} of {owner} is {value:g}", "it must be positive")
-        return value
+        value = values.get(key)
+        return None if value is None else parse_positive(file, f"{key} of {owner}", value)
 
     def focal(key: str, angle_key: str, size: int) -> float | None:
         angle = positive(angle_key) if values.get(key) is None else None

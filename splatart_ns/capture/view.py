@@ -17,6 +17,7 @@ from splatart_ns.capture import images
 from splatart_ns.capture.capture import Capture, CaptureError, Frame, Normalization, State
 from splatart_ns.capture.images import (
     downscale_labels,
+    read_depth_for,
     read_image,
     read_labels,
     read_mask,
@@ -54,6 +55,8 @@ class View:
     """uint8 [H, W]: 0 background, 1..P parts, 255 unlabelled."""
     mask: Tensor | None = None
     """bool [H, W], the pixels that count in the loss."""
+    depth: Tensor | None = None
+    """float32 [H, W], along the optical axis in the normalised world; 0 where unknown."""
 
     def to(self, device: torch.device | str) -> View:
         """The view with its tensors on a device."""
@@ -85,10 +88,9 @@ class View:
         K = self.K.clone()
         K[0, 2] -= left
         K[1, 2] -= top
-        pixels = (self.rgb, self.alpha, self.labels, self.mask)
-        rgb, alpha, labels, mask = (None if x is None else x[top:bottom, left:right] for x in pixels)
-        size = {"width": right - left, "height": bottom - top}
-        return replace(self, K=K, rgb=rgb, alpha=alpha, labels=labels, mask=mask, **size)
+        names = ("rgb", "alpha", "labels", "mask", "depth")
+        pixels = {k: x[top:bottom, left:right] for k in names if (x := getattr(self, k)) is not None}
+        return replace(self, K=K, width=right - left, height=bottom - top, **pixels)
 
 
 def box(shown: Tensor) -> Window:
@@ -122,7 +124,7 @@ def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) ->
         return images.downscale(undistort(read_sized(path, reader, distorted), distorted), downscale)
 
     image = read(frame.image, read_image)
-    alpha = labels = mask = None
+    alpha = labels = mask = depth = None
     if image.shape[2] == 4:
         alpha = torch.from_numpy(np.ascontiguousarray(image[..., 3]))
     if frame.object_mask is not None:
@@ -136,6 +138,9 @@ def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) ->
         labels = torch.from_numpy(downscale_labels(ids, downscale))
     if frame.mask is not None:
         mask = torch.from_numpy(read(frame.mask, lambda path: np.where(read_mask(path), np.uint8(255), 0)) > 127)
+    if frame.depth is not None:
+        measured = read_depth_for(frame.depth, distorted, normalization.scale * frame.depth_unit)
+        depth = torch.from_numpy(downscale_labels(undistort_labels(measured, distorted, unknown=0), downscale))
     T = normalization.camera_to_normal(frame.T_world_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
     return View(
         name=frame.name,
@@ -147,6 +152,7 @@ def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) ->
         alpha=alpha,
         labels=labels,
         mask=mask,
+        depth=depth,
     )
 
 

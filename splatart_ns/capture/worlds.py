@@ -42,5 +42,5 @@ def _placed(state: State, T: np.ndarray) -> State:
     for frame in state.frames:
         pose = T @ frame.T_world_camera
         pose[:3, :3] /= scale
-        frames.append(replace(frame, T_world_camera=pose))
+        frames.append(replace(frame, T_world_camera=pose, depth_unit=scale * frame.depth_unit))
     return replace(state, frames=tuple(frames), placement=T @ state.placement)

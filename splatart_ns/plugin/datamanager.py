@@ -14,7 +14,8 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 
 from splatart_ns.capture.capture import UNLABELLED, Capture
 from splatart_ns.capture.view import View, Window, load_points, load_view
-from splatart_ns.stages.hull import SeedPoints, seed_points, slack, visual_hull
+from splatart_ns.stages.hull import SeedPoints, seed_points, seen_surface, slack, visual_hull
+from splatart_ns.stages.seen_surface import SeenSurface, measured_surface
 from splatart_ns.stages.silhouette import with_silhouette
 from splatart_ns.stages.surroundings import surrounding_points
 
@@ -84,6 +85,15 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
     def capture(self) -> Capture:
         return self.dataparser.capture
 
+    @cached_property
+    def measured(self) -> SeenSurface:
+        """What the frames' own depth tells."""
+        return measured_surface(self.train_dataset.views)
+
+    @cached_property
+    def _trusted_views(self) -> list[View]:
+        return self.measured.trusted_views()
+
     def _add_seed_points(self) -> None:
         """Put points where VanillaPipeline looks for them; none if no image says where the object is."""
         state = self.capture.states[self.dataparser.config.state]
@@ -96,17 +106,18 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         if any(view.alpha is None for view in views):
             outlined = [v for view in views if (v := with_silhouette(view)) is not None]
             around = surrounding_points(views, count, generator) if points is None else points.drawn(count, generator)
-            points = seed_points(outlined, num_parts, count, generator, visual_hull(outlined)) if outlined else None
-            if points is not None:
+            hull = visual_hull(outlined) if outlined else None
+            points = None
+            if hull is not None:
+                points = seed_points(outlined, num_parts, count, generator, hull, seen_surface(outlined, *hull))
                 self.train_dataset.metadata["points3D_inside"] = len(points.xyz)
                 points = points.joined(around)
                 self.train_dataset.metadata["points3D_around"] = len(around.xyz)
         else:
             self.slack, hull = slack(views)
-            if points is None:
-                points = seed_points(views, num_parts, count, generator, hull)
-                if points is not None:
-                    self.train_dataset.metadata["points3D_inside"] = len(points.xyz)
+            if points is None and hull is not None:
+                points = seed_points(views, num_parts, count, generator, hull, seen_surface(views, *hull))
+                self.train_dataset.metadata["points3D_inside"] = len(points.xyz)
         if points is not None:
             self.train_dataparser_outputs.metadata.update(points3D_xyz=points.xyz, points3D_rgb=points.rgb)
             self.train_dataset.metadata["points3D_normals"] = points.normals
@@ -115,9 +126,14 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         """A training frame and its camera: the piece around the object, where the image says which that is.
 
         The camera's metadata have the `whole` width and height, the data which `share` of its pixels the piece has.
+        Where the frame has a depth, the data have what of it others confirm [H, W], else 0.
         """
         camera, data = super().next_train(step)
         left, top, right, bottom = self._windows[data["image_idx"]]
+        depth = self._trusted_views[data["image_idx"]].depth
+        if depth is not None:
+            data["depth"] = depth[top:bottom, left:right]
+            camera.metadata["depth"] = True
         width, height = int(camera.width), int(camera.height)
         camera.metadata["whole"] = width, height
         data["share"] = (right - left) * (bottom - top) / (width * height)

@@ -117,9 +117,8 @@ class SplatartModel(SplatfactoModel):
         splat = self.splat if self.training else self.posed_splat()
         if self.crop_box is not None and not self.training:
             splat = splat.select(self.crop_box.within(splat.means).reshape(-1))
-        rendering = self.rasterize(
-            splat, camera, parts=not self.training, depth=self.config.output_depth_during_training or not self.training
-        )
+        depth = not self.training or self.config.output_depth_during_training or "depth" in (camera.metadata or {})
+        rendering = self.rasterize(splat, camera, parts=not self.training, depth=depth)
         self.info = rendering.info
         if "whole" in (camera.metadata or {}):  # the strategy measures in shares of the image
             factor = self._get_downscale_factor()

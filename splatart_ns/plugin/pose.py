@@ -296,7 +296,7 @@ class PosePipeline(VanillaPipeline):
                 view.width,
                 view.height,
                 features=splat.part_probabilities,
-                with_depth=False,
+                with_depth=model.merged and view.depth is not None,
             )
             for name, loss in pose_loss(rendering, view, model.config.loss_weights, background).items():
                 losses[name] = losses.get(name, 0) + share * loss / len(shots)

@@ -14,6 +14,7 @@ from splatart_ns.plugin.compat import finished_runs, read_checkpoint, run_settin
 from splatart_ns.plugin.gaussians import SPLAT_SHAPES, splat_from_state
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.exposure import at_gain
+from splatart_ns.stages.seen_surface import measured_surface
 from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
 
 _SHAPES = {
@@ -77,7 +78,7 @@ def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
 
 def learned_views(capture: Capture, state: int, checkpoint: dict[str, Tensor], downscale: int = 1) -> list[View]:
     """The training views of a state as its splatart-semantic run saw them in the end: with the cameras that it refined,
-    at one exposure, and without the labels that it did not trust."""
+    at one exposure, and without the labels and the depth that it did not trust."""
     views = load_views(capture, state, "train", downscale)
     learned = [checkpoint.get(f"_model.{name}", ()) for name in ("viewmats", "gains", "trusted")]
     if any(len(values) != len(views) for values in learned):
@@ -85,7 +86,8 @@ def learned_views(capture: Capture, state: int, checkpoint: dict[str, Tensor], d
             f"{capture.path}: the splatart-semantic run of {capture.states[state].name} is of other training frames "
             "than the capture's or of an earlier version; train it again."
         )
-    return [
+    views = [
         replace(view, viewmat=viewmat.float(), rgb=at_gain(view.rgb, gain), labels=view.labels if trusted else None)
         for view, viewmat, gain, trusted in zip(views, *learned, strict=True)
     ]
+    return measured_surface(views).trusted_views()

@@ -1,4 +1,4 @@
-"""Where Gaussians start: on the surface that stereo finds, else in and on the hull of the silhouettes."""
+"""Where Gaussians start: on the surface that the views' depth or stereo tells, else in and on the silhouettes' hull."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.hull import footprint, outermost, project, widened
 from splatart_ns.capture.view import View
+from splatart_ns.stages.seen_surface import SeenSurface, measured_surface
 from splatart_ns.stages.stereo import stereo_surface
 
 MIN_POINTS_PER_PART = {2: 2000, 6: 1000}
@@ -22,7 +23,7 @@ POINTS_PER_PIXEL, POINTS_PER_PART = 1, 300
 the images show. Scissors of 3900 pixels from 4000, 5500 or 8000 points have equal errors and pictures, at .75, .9 and 1
 of the seconds; of an arm of 10 parts and 6200 pixels 5500 are too few."""
 ON_SURFACE = 0.5
-"""Share of the points that start on the hull's surface where stereo finds none at all: plain walls keep to it, but with
+"""Share of the points that start on the hull's surface where none is found at all: plain walls keep to it, but with
 all of them hollows fill up."""
 BESIDE = 2
 """Voxels around a surface that is found where nothing else starts."""
@@ -131,19 +132,23 @@ def surface(voxels: Tensor, size: float) -> Tensor:
     return outermost(full)[cell.unbind(-1)].nonzero()[:, 0]
 
 
+def seen_surface(views: Sequence[View], voxels: Tensor, size: float) -> SeenSurface:
+    """What the views' own depth tells of a hull's object; if that is nothing, what stereo finds."""
+    measured = measured_surface(views)
+    return measured if len(measured.xyz) > 0 else stereo_surface(views, voxels[surface(voxels, size)], size)
+
+
 def seed_points(
-    views: Sequence[View], num_parts: int, count: int, generator: torch.Generator, hull: Hull | None
-) -> SeedPoints | None:
-    """At most `count` points on the surface, and more for parts below a least number; None without a hull.
+    views: Sequence[View], num_parts: int, count: int, generator: torch.Generator, hull: Hull, found: SeenSurface
+) -> SeedPoints:
+    """At most `count` points on the surface that is `found` and in the hull, and more for parts below a least number.
 
     Every view needs its alpha. Small silhouettes get fewer points. A point's part is the label that most labelled views
     give it. The least number keeps small parts from starving: a finger of a robot would get a dozen points otherwise.
     """
-    if hull is None:
-        return None
     pixels = sum(int((view.alpha > 127).sum()) for view in views) / len(views)
     count = min(count, round(POINTS_PER_PIXEL * pixels) + POINTS_PER_PART * num_parts)
-    places = _places(views, *hull)
+    places = _places(*hull, found)
     labels = vote_by_projection(views, places.xyz, num_parts)
     least = next((n for limit, n in MIN_POINTS_PER_PART.items() if num_parts <= limit), MIN_POINTS_OTHERWISE)
     least = min(least, count // num_parts)
@@ -178,9 +183,8 @@ class _Places:
         return SeedPoints(xyz, rgb, normals)
 
 
-def _places(views: Sequence[View], voxels: Tensor, size: float) -> _Places:
-    """The surface that stereo finds, each voxel of it alike; where it finds none, the hull less what is free."""
-    found = stereo_surface(views, voxels[surface(voxels, size)], size)
+def _places(voxels: Tensor, size: float, found: SeenSurface) -> _Places:
+    """The surface that is found, each voxel of it alike; where none is, the hull less what is free."""
     free, blank = found.judged(voxels, size)
     low, voxels, blank = voxels.amin(0), voxels[~free], blank[~free]
     cell = ((voxels - low) / size).round().long()

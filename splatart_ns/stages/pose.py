@@ -14,6 +14,7 @@ from splatart_ns.geometry.se3 import from_rotation_translation, inverse, so3_exp
 from splatart_ns.rasterize.render import Rendering
 from splatart_ns.rasterize.ssim import ssim
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.semantic import depth_loss
 
 
 class PartPoses(nn.Module):
@@ -109,12 +110,14 @@ def carry(splats: Sequence[Splat] | Mapping[int, Splat], T: Tensor, source: int,
 
 @dataclass(frozen=True)
 class PoseLossWeights:
-    """Weights of the paper's four losses. The defaults are measured; the authors' code has .8, .2, 1e-7 and .1."""
+    """Weights of the paper's four losses. The defaults are measured; the authors' code has .8, .2, 1e-7 and .1. And of
+    `depth_loss`, for views that have a depth."""
 
     l1: float = 0.8
     ssim: float = 0.2
     accumulation: float = 0.5
     segmentation: float = 0.5
+    depth: float = 0.5
 
 
 def pose_loss(
@@ -144,6 +147,9 @@ def pose_loss(
     if view.alpha is not None:
         alpha = view.alpha.to(rgb) / 255
         losses["accumulation"] = weights.accumulation * _mean((accumulation[..., 0] - alpha).abs(), valid)
+    if rendering.depth is not None and view.depth is not None:
+        wrong = depth_loss(rendering.depth[0, ..., 0], accumulation[..., 0], view.depth.to(rgb))
+        losses["depth"] = weights.depth * wrong
     if view.labels is not None:
         labels = view.labels.to(rgb.device).long()
         channels = rendering.features[0, ..., 1:]

@@ -22,6 +22,16 @@ def accumulation_loss(accumulation: Tensor, alpha: Tensor) -> Tensor:
     return (accumulation - alpha).abs().mean()
 
 
+def depth_loss(depth: Tensor, accumulation: Tensor, seen: Tensor) -> Tensor:
+    """How far Gaussians lie before and behind the surface that is seen: the mean over the image, 0 where none is.
+
+    Args:
+        depth: Expected depth as rendered [H, W], and its accumulation [H, W].
+        seen: Depth of the surface [H, W]; 0 where unknown.
+    """
+    return ((seen > 0) * accumulation * (depth - seen).abs()).mean()
+
+
 def part_image(rendering: Rendering) -> Tensor:
     """The probability of background and every part at each pixel [C, H, W, P + 1].
 

@@ -111,8 +111,12 @@ def fit_worlds(
 
 def moved_views(views: Sequence[View], T: Tensor) -> list[View]:
     """The views after the similarity T [4, 4] of their world."""
-    back = inverse_similarity(T.double())
-    return [replace(v, viewmat=view_of_moved(v.viewmat.double(), back.to(v.viewmat.device)).float()) for v in views]
+    back, scale = inverse_similarity(T.double()), float(scale_of(T))
+    moved = []
+    for v in views:
+        viewmat = view_of_moved(v.viewmat.double(), back.to(v.viewmat.device)).float()
+        moved.append(replace(v, viewmat=viewmat, depth=None if v.depth is None else scale * v.depth))
+    return moved
 
 
 def moved_splat(splat: Splat, T: Tensor) -> Splat:

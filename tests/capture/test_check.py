@@ -186,7 +186,7 @@ def test_a_part_that_is_never_labelled_is_an_error(capture_folder):
 
 
 def test_points_masks_and_depths_are_checked(capture_folder, edit):
-    np.save(capture_folder / "state_00/d.npy", np.zeros((4, 4)))
+    np.save(capture_folder / "state_00/d.npy", np.zeros((4, 7)))
     put(capture_folder / "state_00/m.png", np.zeros((16, 16), np.uint8))
 
     def change(meta):

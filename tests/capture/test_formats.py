@@ -140,6 +140,23 @@ def test_optional_files_and_points_are_found(capture_folder, edit):
     assert [p.name for p in found] == ["o.png", "m.png", "d.npy"]
 
 
+def test_a_count_of_depth_is_a_millimetre_unless_the_file_or_the_frame_says_otherwise(capture_folder, edit):
+    def change(meta):
+        meta["depth_unit_scale_factor"] = 0.25
+        meta["frames"][1]["depth_unit_scale_factor"] = 2
+
+    assert load_capture(capture_folder).states[0].frames[0].depth_unit == 1e-3
+    edit(capture_folder / FILE, change)
+    assert [f.depth_unit for f in load_capture(capture_folder).states[0].frames[:3]] == [0.25, 2, 0.25]
+
+
+@pytest.mark.parametrize("unit", [0, -1, "mm", None, True, 1e300])
+def test_a_unit_of_depth_that_is_no_length_is_refused(capture_folder, edit, unit):
+    edit(capture_folder / FILE, lambda meta: meta.update(depth_unit_scale_factor=unit))
+    with pytest.raises(InputError, match="depth_unit_scale_factor of frame 'images/0000.png' is "):
+        load_capture(capture_folder)
+
+
 def test_rounded_rotations_are_made_exact(capture_folder, edit):
     edit(capture_folder / FILE, lambda m: m["frames"][0].update(transform_matrix=np.round(pose_of(m), 3).tolist()))
     T = load_capture(capture_folder).states[0].frames[0].T_world_camera

@@ -5,10 +5,12 @@ from PIL import Image
 
 from splatart_ns.capture.capture import Camera
 from splatart_ns.capture.images import (
+    depth_unit,
     downscale,
     downscale_labels,
     image_size,
     read_depth,
+    read_depth_for,
     read_image,
     read_labels,
     read_mask,
@@ -16,6 +18,7 @@ from splatart_ns.capture.images import (
     undistort,
     undistort_labels,
     undistorted_camera,
+    write_depth,
 )
 from splatart_ns.errors import InputError
 
@@ -112,6 +115,29 @@ def test_depth_is_in_millimetres_in_both_forms(tmp_path):
         depth = read_depth(path)
         assert depth.dtype == np.float32
         np.testing.assert_allclose(depth, [[0, 1.5]])
+
+
+def test_what_is_written_as_depth_is_read_again(tmp_path):
+    depth = np.array([[0.0, 0.7], [2.0, 2.9]], np.float32)
+    unit = depth_unit(2.9)
+    assert unit == pytest.approx(1e-4) and 2 * 2.9 / unit < 65536
+    write_depth(tmp_path / "d.png", depth, unit)
+    np.testing.assert_allclose(read_depth(tmp_path / "d.png", unit), depth, atol=unit / 2)
+
+
+def test_pixels_take_the_nearest_of_a_smaller_depth(tmp_path):
+    np.save(tmp_path / "d.npy", np.array([[1000.0, 2000.0], [3000.0, 0.0]]))
+    depth = read_depth_for(tmp_path / "d.npy", Camera(8.0, 8.0, 4.0, 3.0, 8, 6))
+    assert depth.shape == (6, 8)
+    corners = np.kron([[1.0, 2.0], [3.0, 0.0]], np.ones((3, 4)))
+    np.testing.assert_allclose(depth, corners, rtol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (2, 0), (4, 3), (6, 2)])
+def test_a_depth_of_another_shape_is_refused(tmp_path, shape):
+    np.save(tmp_path / "d.npy", np.ones(shape))
+    with pytest.raises(InputError, match="d.npy: the depth is .* pixels, and not a smaller 8x6"):
+        read_depth_for(tmp_path / "d.npy", Camera(8.0, 8.0, 4.0, 3.0, 8, 6))
 
 
 def test_a_pickled_depth_is_refused(tmp_path):

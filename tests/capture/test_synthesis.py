@@ -11,6 +11,7 @@ from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.scene import camera_poses
 from splatart_ns.capture.synthesis import synthesize
 from splatart_ns.capture.synthesis_options import SynthesisOptions
+from splatart_ns.capture.view import load_views
 from splatart_ns.errors import InputError
 
 URDF = """<robot name="toy">
@@ -159,6 +160,25 @@ def test_the_same_seed_writes_the_same_bytes_and_another_one_does_not(urdf, tmp_
     other = files(synthesize(urdf, tmp_path / "other", replace(options, seed=1)))
     truth = next(p for p in other if p.name == "ground_truth.json")
     assert other[truth] != files(capture)[truth]
+
+
+def test_depth_is_that_of_the_surface(urdf, tmp_path):
+    folder = synthesize(urdf, tmp_path / "c", replace(SMALL, depth=True))
+    capture = load_capture(folder)
+    points = trimesh.load(folder / "ground_truth_points/part_1.ply").vertices
+    points = np.concatenate([points, trimesh.load(folder / "ground_truth_points/part_2.ply").vertices])
+    scale, centre = capture.normalization.scale, capture.normalization.centre
+    for view in load_views(capture, 0, "test"):
+        row, column = (view.depth > 0).nonzero().T.numpy()
+        assert set(map(tuple, view.labels.nonzero().tolist())) == set(zip(row, column, strict=True))
+        K, T = view.K.double().numpy(), np.linalg.inv(view.viewmat.double().numpy())
+        z = view.depth[row, column].double().numpy()
+        x = np.stack([(column + 0.5 - K[0, 2]) / K[0, 0] * z, (row + 0.5 - K[1, 2]) / K[1, 1] * z, z, np.ones_like(z)])
+        world = (T @ x)[:3].T / scale + centre
+        known = np.isin(view.labels[row, column].numpy(), (1, 2))
+        assert known.sum() > 50
+        away = np.linalg.norm(world[known, None] - points, axis=-1).min(1)
+        assert np.median(away) < 0.004  # of 10,000 points on each
 
 
 def test_given_joint_values_are_used(urdf, tmp_path):

@@ -49,6 +49,23 @@ def test_an_object_that_fills_the_images_has_radius_one(capture_folder):
     assert view.width / 2 * distance / view.K[0, 0] == pytest.approx(1, rel=1e-5)
 
 
+def test_depth_is_in_the_normalised_world(capture_folder, edit):
+    depth = np.zeros((16, 16), np.uint16)
+    depth[6, 4:12] = 4000 + 100 * np.arange(8)
+    cv2.imwrite(str(capture_folder / "state_00/d.png"), depth)
+    edit(capture_folder / FILE, lambda m: m["frames"][0].update(depth_file_path="d.png", depth_unit_scale_factor=1e-3))
+    capture = load_capture(capture_folder)
+    first, second = load_views(capture, 0)[:2]
+    assert second.depth is None and first.depth.dtype == torch.float32
+    assert first.depth.numpy() == pytest.approx(depth * 1e-3 * capture.normalization.scale)
+    small = load_views(capture, 0, downscale=2)[0]
+    assert torch.equal(small.depth, first.depth[1::2, 1::2])  # never a mean of two surfaces
+    piece = first.cropped((4, 5, 12, 8))
+    assert torch.equal(piece.depth, first.depth[5:8, 4:12])
+    camera = first.viewmat[:3, 3]  # where the normalised world's origin is: 4 away, which the object lies about
+    assert first.depth[6, 4] == pytest.approx(float(camera[2]) * 4 / np.linalg.norm([4, 1.2]), rel=1e-5)
+
+
 def test_the_object_mask_cuts_off_what_else_the_images_alpha_shows(capture_folder, edit):
     mask = np.zeros((16, 16), np.uint8)
     mask[:, :6] = 255

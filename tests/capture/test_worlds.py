@@ -50,6 +50,7 @@ def test_similarities_move_cameras_and_are_remembered(capture):
     assert np.array_equal(poses(moved, 0), poses(capture, 0))
     assert np.allclose(poses(moved, 1)[:, :3, 3], poses(capture, 1)[:, :3, 3] @ T[1, :3, :3].T + T[1, :3, 3])
     assert np.allclose(np.linalg.det(poses(moved, 1)[:, :3, :3]), 1)
+    assert [state.frames[0].depth_unit for state in moved.states] == pytest.approx([1e-3, 1.7e-3])
     back = in_one_world(moved, np.linalg.inv(T))
     assert np.allclose(poses(back, 1), poses(capture, 1)) and np.allclose(back.states[1].placement, np.eye(4))
 

@@ -25,6 +25,13 @@ def capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def depth_capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A hinge in images of 64 x 64 with depth. Not to be changed."""
+    options = SynthesisOptions(train_views=10, test_views=2, resolution=64, depth=True)
+    return synthesize_object("hinge", tmp_path_factory.mktemp("captures") / "depth", options)
+
+
+@pytest.fixture(scope="session")
 def opaque_capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same without alpha and silhouettes, in front of grey."""
     path = tmp_path_factory.mktemp("captures") / "opaque"

@@ -123,6 +123,23 @@ def test_training_sees_the_piece_of_a_frame_that_shows_the_object(capture_dir: P
     assert manager.train_cameras.width.unique().tolist() == [192]
 
 
+def test_batches_have_the_depth_that_other_frames_confirm(capture_dir: Path, depth_capture_dir: Path) -> None:
+    manager = manage(depth_capture_dir, seed_gaussians=200)
+    xyz, normals = (manager.train_dataparser_outputs.metadata["points3D_xyz"], manager.measured.normals)
+    assert (normals.norm(dim=-1) > 0).any()
+    assert torch.cdist(xyz, manager.measured.xyz).amin(1).quantile(0.6) < 0.02  # the rest is underneath
+    for step in range(3):
+        camera, batch = manager.next_train(step)
+        view = manager.train_dataset.views[batch["image_idx"]]
+        left, top, right, bottom = view.object_window()
+        trusted, given = batch["depth"], view.depth[top:bottom, left:right]
+        assert trusted.shape == batch["image"].shape[:2] and camera.metadata["depth"]
+        assert ((trusted == given) | (trusted == 0)).all()
+        assert 0.7 * (given > 0).sum() < (trusted > 0).sum() < (given > 0).sum()
+    camera, batch = manage(capture_dir).next_train(0)
+    assert "depth" not in batch and "depth" not in camera.metadata
+
+
 def framed(view: View, border: int) -> View:
     """The view with nothing around it."""
     pixels = {name: getattr(view, name) for name in ("rgb", "alpha", "labels")}

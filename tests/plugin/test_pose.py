@@ -1,5 +1,6 @@
 import copy
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -200,7 +201,9 @@ def test_merged_gaussians_learn_from_the_pieces_that_show_the_object(pose_traine
         whole = next(view for view in pipeline.views[state] if view.name == piece.name)
         assert piece.alpha.sum() == whole.alpha.sum()
         assert share == piece.width * piece.height / (whole.width * whole.height) < 1
-    pipeline._own = iter([(state, piece, share), (state, piece, 0.5 * share)])
+    far = replace(piece, depth=torch.full(piece.alpha.shape, 50.0))
+    pipeline._own = iter([(state, piece, share), (state, piece, 0.5 * share), (state, far, share)])
     pipeline.model.merged.fill_(True)
-    first, second = (sum(pipeline.get_train_loss_dict(step)[1].values()) for step in (0, 0))
-    assert float(second) < 0.9 * float(first)
+    first, second, third = (pipeline.get_train_loss_dict(step)[1] for step in (0, 0, 0))
+    assert float(sum(second.values())) < 0.9 * float(sum(first.values()))
+    assert "depth" not in first and float(third["depth"]) > 0.5 * share  # they are two or three away

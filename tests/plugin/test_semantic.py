@@ -71,6 +71,32 @@ def test_labels_that_contradict_the_others_are_not_learned(capture_dir, semantic
     assert trainer.pipeline.model.trusted.tolist() == trusted
 
 
+def test_gaussians_learn_from_depth(depth_capture_dir, semantic_trainer):
+    trainer = semantic_trainer(depth_capture_dir, steps=12, semantic_start=10)
+    pipeline = trainer.pipeline
+    assert pipeline.findings["depth"]["confirmed"] > 0.8 and not pipeline.notes
+    pipeline.model.step_cb(trainer.optimizers, 0)
+    with torch.no_grad():
+        pipeline.model.gauss_params["means"].mul_(0.9)
+    _, losses, _ = pipeline.get_train_loss_dict(0)
+    assert 0.5 * 0.1 * 0.05 < float(losses["depth"]) < 0.5 * 0.1 * 0.6  # a share of the image, and weighted
+    (gradient,) = torch.autograd.grad(losses["depth"], pipeline.model.gauss_params["means"])
+    assert gradient.abs().sum() > 0
+
+
+def test_depth_that_contradicts_itself_is_told_and_not_used(depth_capture_dir, semantic_trainer, tmp_path):
+    capture = shutil.copytree(depth_capture_dir, tmp_path / "capture")
+    file = capture / "state_00/transforms.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"depth_unit_scale_factor": 1.0}))
+    trainer = semantic_trainer(capture)
+    pipeline = trainer.pipeline
+    (note,) = pipeline.notes
+    assert note.startswith("state_00: other frames confirm ") and "depth_unit_scale_factor" in note
+    assert pipeline.findings["depth"]["confirmed"] < 0.3
+    pipeline.model.step_cb(trainer.optimizers, 0)
+    assert float(pipeline.get_train_loss_dict(0)[1]["depth"]) == 0
+
+
 def test_frames_of_different_exposures_are_evened_also_for_the_next_stage(capture_dir, semantic_trainer, tmp_path):
     capture, gains = shutil.copytree(capture_dir, tmp_path / "capture"), {}
     meta = json.loads((capture / "state_00/transforms.json").read_text())

@@ -28,5 +28,17 @@ def test_views_are_seen_as_stage_1_left_them(capture_dir):
     assert torch.equal(torch.stack([view.viewmat for view in seen]), moved.float())
     small = learned_views(capture, 0, checkpoint, downscale=2)
     assert [(view.width, *view.rgb.shape[:2]) for view in small] == [(32, 32, 32)] * len(views)
+    assert all(view.depth is None for view in seen)
     with pytest.raises(InputError, match="train it again"):
         learned_views(capture, 0, {"_model.viewmats": moved, "_model.gains": checkpoint["_model.gains"]})
+
+
+def test_depth_that_no_other_view_confirms_is_left_out(depth_capture_dir):
+    capture = require_valid(depth_capture_dir)
+    views = load_views(capture, 0, "train")
+    checkpoint = {"_model.viewmats": torch.stack([view.viewmat for view in views]).double()}
+    checkpoint |= {"_model.gains": torch.ones(len(views), 3), "_model.trusted": torch.ones(len(views)).bool()}
+    for view, given in zip(learned_views(capture, 0, checkpoint), views, strict=True):
+        known = view.depth > 0
+        assert torch.equal(view.depth[known], given.depth[known])
+        assert 0.6 * (given.depth > 0).sum() < known.sum() < (given.depth > 0).sum()

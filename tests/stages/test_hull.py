@@ -11,6 +11,7 @@ from splatart_ns.stages.hull import (
     POINTS_PER_PIXEL,
     carve,
     seed_points,
+    seen_surface,
     slack,
     surface,
     visual_hull,
@@ -22,8 +23,12 @@ BASE, KNOB = box(1, SIZE, (0.0, 0.0, -0.1)), box(2, (0.16, 0.16, 0.16), (0.0, 0.
 VIEWS = photograph(Splat.cat([BASE, KNOB]), count=14)
 
 
+def started(views, count, hull, seed: int = 0):
+    return seed_points(views, 2, count, torch.Generator().manual_seed(seed), hull, seen_surface(views, *hull))
+
+
 def seeds(seed: int = 0):
-    return seed_points(VIEWS, 2, 500, torch.Generator().manual_seed(seed), visual_hull(VIEWS, resolution=40))
+    return started(VIEWS, 500, visual_hull(VIEWS, resolution=40), seed)
 
 
 def test_the_hull_holds_the_object_and_little_more():
@@ -66,7 +71,7 @@ def test_a_small_part_gets_its_least_number_of_points():
     labels = vote_by_projection(VIEWS, seeds().xyz, 2)  # of 500 points, 250 each: it has a fortieth of the volume
     assert (labels == 2).sum() > 0.8 * 250
     fine = photograph(Splat.cat([BASE, KNOB]), count=6, pixels=240)
-    points = seed_points(fine, 2, 4000, torch.Generator().manual_seed(0), visual_hull(fine, resolution=40))
+    points = started(fine, 4000, visual_hull(fine, resolution=40))
     labels = vote_by_projection(fine, points.xyz, 2)
     assert 0.8 * MIN_POINTS_PER_PART[2] < (labels == 2).sum() < 1.5 * MIN_POINTS_PER_PART[2]
 
@@ -84,7 +89,7 @@ def test_where_stereo_finds_nothing_half_of_the_points_start_on_the_hulls_surfac
     voxels, size = visual_hull(VIEWS, resolution=40)
     # Plain, and no part is filled up.
     silent = [replace(view, rgb=torch.full_like(view.rgb, 99), labels=None) for view in VIEWS]
-    points = seed_points(silent, 2, 3000, torch.Generator().manual_seed(0), (voxels, size)).xyz
+    points = started(silent, 3000, (voxels, size)).xyz
     outer = surface(voxels, size)
     inner = torch.ones(len(voxels), dtype=torch.bool)
     inner[outer] = False
@@ -96,12 +101,12 @@ def test_where_stereo_finds_nothing_half_of_the_points_start_on_the_hulls_surfac
 def test_small_silhouettes_get_fewer_points():
     pixels = sum(float((view.alpha > 127).sum()) for view in VIEWS) / len(VIEWS)
     hull = visual_hull(VIEWS, resolution=40)
-    points = [seed_points(VIEWS, 2, n, torch.Generator().manual_seed(0), hull) for n in (20000, 40000)]
+    points = [started(VIEWS, n, hull) for n in (20000, 40000)]
     assert len(points[0].xyz) == len(points[1].xyz)
     enough = POINTS_PER_PIXEL * pixels + POINTS_PER_PART * 2
     assert enough - 1 < len(points[0].xyz) < 2 * enough  # and the small part's
     far = photograph(Splat.cat([BASE, KNOB]), count=14, pixels=24)
-    less = seed_points(far, 2, 20000, torch.Generator().manual_seed(0), hull)
+    less = started(far, 20000, hull)
     assert len(less.xyz) < 0.7 * len(points[0].xyz)
 
 
@@ -112,11 +117,11 @@ def test_points_have_the_colours_of_the_images_and_repeat_by_seed():
     assert 0 <= first.rgb.min() and first.rgb.max() <= 255 and first.rgb.std() > 5
 
 
-def test_no_silhouette_gives_no_points():
+def test_no_silhouette_gives_no_hull():
     empty = [view.to("cpu") for view in VIEWS]
     for view in empty:
         view.alpha = torch.zeros_like(view.alpha)
-    assert seed_points(empty, 2, 100, torch.Generator().manual_seed(0), visual_hull(empty)) is None
+    assert visual_hull(empty) is None
 
 
 def test_silhouettes_of_wrong_cameras_have_slack():

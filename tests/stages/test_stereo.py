@@ -8,7 +8,8 @@ from part_scene import cameras
 
 from splatart_ns.capture.view import View
 from splatart_ns.stages import stereo
-from splatart_ns.stages.hull import _places, seed_points, surface, visual_hull
+from splatart_ns.stages.hull import _places, seed_points, seen_surface, surface, visual_hull
+from splatart_ns.stages.seen_surface import agreed, neighbours
 from splatart_ns.stages.stereo import stereo_surface
 
 pytest.importorskip("numba", reason="stereo is found by numba kernels")
@@ -95,10 +96,10 @@ def test_points_have_the_colour_of_their_place(found):
 
 
 def test_a_depth_that_no_other_view_finds_does_not_count(views, found):
-    others = stereo._others(torch.stack([v.viewmat for v in views]).double(), torch.zeros(3, dtype=torch.float64))
+    others = neighbours(torch.stack([v.viewmat for v in views]).double(), torch.zeros(3, dtype=torch.float64))
     depth = found.depth.clone()
     depth[5] *= 1.1
-    again = stereo._agreed(views, others, depth, torch.zeros(*depth.shape, 3), found.stride)
+    again = agreed(views, others, depth, torch.zeros(*depth.shape, 3), found.stride)
     assert again.depth[5].isfinite().sum() < 0.2 * depth[5].isfinite().sum()
     assert again.depth[9].isfinite().sum() > 0.9 * depth[9].isfinite().sum()
 
@@ -122,7 +123,7 @@ def test_a_hollow_is_free_and_walls_are_not(hull, found):
 
 
 def test_seed_points_start_on_the_surface_that_is_found(views, hull, found):
-    points = seed_points(views, 1, 3000, torch.Generator().manual_seed(0), hull)
+    points = seed_points(views, 1, 3000, torch.Generator().manual_seed(0), hull, seen_surface(views, *hull))
     assert to_tray(points.xyz).quantile(0.8) < 0.02
     on_surface = points.normals.norm(dim=-1) > 0
     assert on_surface.float().mean() > 0.8
@@ -132,12 +133,12 @@ def test_seed_points_start_on_the_surface_that_is_found(views, hull, found):
     same = (normals[:200, None] == found.normals).all(-1)
     off = ((xyz[:200, None] - found.xyz) * normals[:200, None]).sum(-1).abs().where(same, torch.tensor(torch.inf))
     assert off.amin(1).max() < 1e-5 and torch.cdist(xyz[:200], found.xyz).amin(1).max() > 1e-4
-    again = seed_points(views, 1, 3000, torch.Generator().manual_seed(0), hull)
+    again = seed_points(views, 1, 3000, torch.Generator().manual_seed(0), hull, seen_surface(views, *hull))
     assert torch.equal(points.xyz, again.xyz)
 
 
-def test_every_voxel_is_left_to_parts_that_have_no_other_places(views, hull):
-    places = _places(views, *hull)
+def test_every_voxel_is_left_to_parts_that_have_no_other_places(hull, found):
+    places = _places(*hull, found)
     voxel = places.rgb.isnan().all(-1)
     assert (places.weight > 0).all()
     beside = voxel & (to_tray(places.xyz) < hull[1])
@@ -199,7 +200,7 @@ def test_few_views_find_nothing(views, hull, count):
 def test_without_numba_points_start_in_and_on_the_hull(views, hull, monkeypatch):
     monkeypatch.setattr(stereo, "has_numba", lambda: False)
     assert len(stereo_surface(views, *outer(hull)).xyz) == 0
-    points = seed_points(views, 1, 1000, torch.Generator().manual_seed(0), hull)
+    points = seed_points(views, 1, 1000, torch.Generator().manual_seed(0), hull, seen_surface(views, *hull))
     assert (points.normals == 0).all() and points.rgb.isfinite().all() and len(points.xyz) >= 1000
     # The hollow is full of them.
     assert ((points.xyz[:, :2].abs() < 0.3).all(-1) & (points.xyz[:, 2] > -0.1)).sum() > 50

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from part_scene import NUM_PARTS, angle_deg, motion, two_states
@@ -16,6 +18,13 @@ def apart(scale):
     M = motion((100, -60, 40), (0.3, 0.2, -0.2))
     T = similarity(scale, M[:3, :3], M[:3, 3])
     return (splats[0], moved_splat(splats[1], T)), (views[0], moved_views(views[1], T)), T
+
+
+def test_depth_grows_with_the_world():
+    _, (views, _) = two_states(TURN)
+    view = replace(views[0], depth=torch.full((4, 4), 2.0))
+    first, second = moved_views([view, views[1]], similarity(1.5, TURN[:3, :3], TURN[:3, 3]))
+    assert second.depth is None and torch.allclose(first.depth, torch.tensor(3.0))
 
 
 @pytest.mark.parametrize(("scale", "with_scale"), [(1.6, True), (1.0, False)])
