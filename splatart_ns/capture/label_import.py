@@ -261,8 +261,6 @@ def _transforms(capture: Capture) -> dict[str, Any]:
             for key, file in own.items():
                 if file is not None:
                     entry[key] = file.relative_to(capture.path).as_posix()
-            if frame.depth is not None:
-                entry["depth_unit_scale_factor"] = frame.depth_unit
             frames.append(entry)
             lists[f"{frame.split}_filenames"].append(image)
     return {"camera_model": "PINHOLE", **lists, "frames": frames}

@@ -23,7 +23,8 @@ OTHERS = 6
 LEAST_ANGLE = 4.0
 """Degrees between views below which depth hardly shows."""
 TOLERANCE = 0.01
-"""A place counts where one other view finds the same depth, to this relative error."""
+"""A place counts where one other view finds the same depth, to this relative error. (Two would leave 57 % of what
+one of ten views measured.)"""
 _IN_FRONT = 2.0
 """Voxels that a place must lie before a surface to be free, for the surface's own error ..."""
 _FREED_BY = 2
@@ -104,9 +105,13 @@ def measured_surface(views: Sequence[View]) -> SeenSurface:
             middle = torch.where(here, view.depth, torch.inf)[stride // 2 :: stride, stride // 2 :: stride]
             depth[i, : middle.shape[0], : middle.shape[1]] = middle
             normals[i] = _normals(view, depth[i], stride)
-    poses = torch.stack([view.viewmat for view in views]).double()
+    having = torch.tensor([bool(d.isfinite().any()) for d in depth]).nonzero()[:, 0]
+    poses = torch.stack([view.viewmat for view in views]).double()[having]
     # They look at the middle of the normalised world.
-    found = agreed(views, neighbours(poses, torch.zeros(3).to(poses)), depth, normals, stride)
+    nearest = having[neighbours(poses, torch.zeros(3).to(poses))]
+    others = torch.zeros(len(views), nearest.shape[-1], dtype=torch.long)
+    others[having] = nearest
+    found = agreed(views, others, depth, normals, stride)
     return found if found.confirmed >= LEAST_CONFIRMED else SeenSurface.nothing(views, found.confirmed)
 
 

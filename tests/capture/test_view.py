@@ -116,8 +116,17 @@ def test_smaller_views_have_smaller_cameras_and_unmixed_labels(capture_folder):
 
 
 def test_distorted_frames_are_undistorted_together(capture_folder, edit):
-    edit(capture_folder / FILE, lambda m: m.update(k1=-0.3))
-    view = load_views(load_capture(capture_folder), 0)[0]
+    labels = cv2.imread(str(capture_folder / "state_00/labels/0000.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(capture_folder / "state_00/d.png"), 1000 * labels.astype(np.uint16))
+
+    def change(meta):
+        meta.update(k1=-0.3)
+        meta["frames"][0]["depth_file_path"] = "d.png"
+
+    edit(capture_folder / FILE, change)
+    capture = load_capture(capture_folder)
+    view = load_views(capture, 0)[0]
+    torch.testing.assert_close(view.depth, capture.normalization.scale * view.labels.where(view.labels < 3, 0).float())
     size = (view.height, view.width)
     assert view.rgb.shape[:2] == view.alpha.shape == view.labels.shape == size
     assert view.K[0, 0] != 20

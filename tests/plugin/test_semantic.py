@@ -82,6 +82,10 @@ def test_gaussians_learn_from_depth(depth_capture_dir, semantic_trainer):
     assert 0.5 * 0.1 * 0.05 < float(losses["depth"]) < 0.5 * 0.1 * 0.6  # a share of the image, and weighted
     (gradient,) = torch.autograd.grad(losses["depth"], pipeline.model.gauss_params["means"])
     assert gradient.abs().sum() > 0
+    pipeline.model.config.num_downscales, pipeline.model.config.resolution_schedule = 1, 100
+    assert pipeline.model._get_downscale_factor() == 2
+    _, halved, _ = pipeline.get_train_loss_dict(0)
+    assert float(halved["depth"]) == pytest.approx(float(losses["depth"]), rel=0.5)  # of another frame
 
 
 def test_depth_that_contradicts_itself_is_told_and_not_used(depth_capture_dir, semantic_trainer, tmp_path):

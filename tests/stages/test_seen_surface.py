@@ -6,7 +6,7 @@ from part_scene import cameras
 
 from splatart_ns.capture.view import View
 from splatart_ns.stages.hull import seed_points, seen_surface, visual_hull
-from splatart_ns.stages.seen_surface import measured_surface
+from splatart_ns.stages.seen_surface import _normals, measured_surface
 from splatart_ns.stages.semantic import depth_loss
 
 PIXELS, RADIUS = 96, 0.6
@@ -65,6 +65,25 @@ def test_depth_of_another_unit_is_not_used(views, factor):
     assert not any(view.depth.any() for view in found.trusted_views())
 
 
+def test_depth_that_others_confirm_by_chance_alone_is_not_used(views):
+    rng = torch.Generator().manual_seed(0)
+    factors = (0.5 * torch.randn(len(views), generator=rng)).exp()
+    found = measured_surface([replace(v, depth=f * v.depth) for v, f in zip(views, factors, strict=True)])
+    assert 0.02 < found.confirmed < 0.3 and len(found.xyz) == 0
+    assert not any(view.depth.any() for view in found.trusted_views())
+
+
+def test_steps_have_no_normals(views):
+    """A near plate before a far one: along its rim neighbours lie on both."""
+    depth = torch.full((8, 9), 3.0)
+    depth[:, :5] = 1.0
+    normals = _normals(views[0], depth, stride=3)
+    known = normals.norm(dim=-1) > 0
+    assert not known[:, 4:6].any() and not known[0].any() and not known[:, -1].any()
+    assert known[1:-1, 1:4].all() and known[1:-1, 6:-1].all()
+    assert torch.allclose(normals[known], torch.tensor([0.0, 0.0, -1.0]), atol=1e-5)
+
+
 def test_what_no_view_knows_is_not_found(views):
     none = [replace(view, depth=torch.zeros_like(view.depth)) for view in views]
     found = measured_surface(none)
@@ -84,6 +103,14 @@ def test_some_frames_may_lack_a_depth(views):
     voxels, size = visual_hull(half, resolution=32)
     at_surface = (voxels.norm(dim=-1) - RADIUS).abs() < size
     assert found.judged(voxels[at_surface], size)[1].median() < 0.2  # blank in few of those that have a depth
+
+
+@pytest.mark.parametrize("count, finds", [(0, False), (1, False), (2, True), (3, True)])
+def test_a_single_depth_is_not_believed_and_two_are(views, count, finds):
+    few = [view if k < count else replace(view, depth=None) for k, view in enumerate(views)]
+    found = measured_surface(few)
+    assert (len(found.xyz) > 50) == finds
+    assert len(found.trusted_views()) == len(views)
 
 
 def test_gaussians_start_on_what_is_measured(views):
