@@ -15,6 +15,7 @@ def capture_digest(capture: Capture, states: Sequence[State] | None = None) -> s
         digest.update(state.name.encode() + (state.points.read_bytes() if state.points else b""))
         for frame in state.frames:
             digest.update(repr((frame.name, frame.camera, frame.T_world_camera.tolist(), frame.split)).encode())
+            digest.update(repr(frame.depth_unit).encode() if frame.depth else b"")
             for file in (frame.image, frame.labels, frame.object_mask, frame.mask, frame.depth):
                 digest.update(file.read_bytes() if file else b"-")
     return digest.hexdigest()

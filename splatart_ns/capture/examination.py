@@ -15,8 +15,9 @@ from torch import Tensor
 
 from splatart_ns.capture.capture import Capture, Frame, Normalization, Problem, State
 from splatart_ns.capture.check import check_structure
-from splatart_ns.capture.hull import carve, fitting_views, silhouette, visible
+from splatart_ns.capture.hull import carve, fitting_views, project, silhouette, visible
 from splatart_ns.capture.part_votes import Ballot, PartVotes, read_ballots, vote
+from splatart_ns.capture.seen_surface import LEAST_CONFIRMED, measured_surface
 from splatart_ns.capture.view import View, load_view
 from splatart_ns.errors import InputError
 
@@ -38,6 +39,8 @@ _MOST_WRONG = 30
 """So many wrong frames are named of each state."""
 _WIDE_BAND, _SHIFTED_BAND = 0.02, 0.02
 """How far a labels' outline may lie from the silhouette's, as a share of the object's size: all frames, one frame."""
+_ONE_UNIT = 1.2
+"""Depths are of another unit than told if half of their ratios to the hull's lie within this factor."""
 _STAYS, _MOVES = 0.93, 0.6
 """A part rests from one state to another if so much of it is at the same place, and moves if less than the second; in
 between, another part may have moved before it."""
@@ -147,6 +150,7 @@ def examine(path: Path | str, suggest: int = 0) -> Examination:
     num_parts = max(capture.parts, default=0)
     for one in evidence:
         problems.extend(_carve(capture, one))
+        problems.extend(_check_depth(capture, one))
         problems.extend(_check_outlines(capture, one))
         if len(one.points) and one.labelled:
             one.votes = vote(one.labelled, one.points, one.size, num_parts)
@@ -220,6 +224,29 @@ def _carve(capture: Capture, one: _Evidence) -> Iterator[Problem]:
     one.points, one.size = carving.surface(fitting), carving.size
     one.frames = [frame for i, frame in enumerate(one.frames) if i not in odd]
     one.views = [view for i, view in enumerate(one.views) if i not in odd]
+
+
+def _check_depth(capture: Capture, one: _Evidence) -> Iterator[Problem]:
+    """Depth that contradicts itself from frame to frame, and what unit it seems to have."""
+    measured = measured_surface(one.views)
+    if measured.confirmed >= LEAST_CONFIRMED:
+        return
+    ratios = [_depth_ratio(view, one.points, one.size) for view in one.views if view.depth is not None]
+    ratio = torch.cat([torch.zeros(0), *ratios])
+    mend = "check that depth is along the optical axis of these frames, or take depth_file_path out; it is not used"
+    if len(ratio) > _ENOUGH_POINTS and ratio.quantile(0.75) < _ONE_UNIT * ratio.quantile(0.25):
+        unit = float(ratio.median()) * next(frame.depth_unit for frame in one.frames if frame.depth is not None)
+        mend = f"by the silhouettes depth_unit_scale_factor would be about {unit:.2g}; until it is, depth is not used"
+    found = f"other frames confirm {measured.confirmed:.0%} of the frames' depth"
+    yield Problem("warning", capture.path / one.state.name, found, mend)
+
+
+def _depth_ratio(view: View, points: Tensor, size: float) -> Tensor:
+    """How many times deeper than its depth image says a view sees those of a hull's points [N, 3] that it sees."""
+    column, row, depth, _ = project(view, points)
+    told = view.depth[row, column]
+    known = (visible(view, points, size) if len(points) else torch.zeros(0, dtype=torch.bool)) & (told > 0)
+    return depth[known] / told[known]
 
 
 def _check_outlines(capture: Capture, one: _Evidence) -> Iterator[Problem]:

@@ -13,9 +13,9 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
 from splatart_ns.capture.capture import UNLABELLED, Capture
+from splatart_ns.capture.seen_surface import SeenSurface, measured_surface
 from splatart_ns.capture.view import View, Window, load_points, load_view
 from splatart_ns.stages.hull import SeedPoints, seed_points, seen_surface, slack, visual_hull
-from splatart_ns.stages.seen_surface import SeenSurface, measured_surface
 from splatart_ns.stages.silhouette import with_silhouette
 from splatart_ns.stages.surroundings import surrounding_points
 

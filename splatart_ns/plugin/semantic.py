@@ -13,6 +13,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from splatart_ns.capture.seen_surface import LEAST_CONFIRMED
 from splatart_ns.capture.view import View
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import inverse
@@ -21,7 +22,6 @@ from splatart_ns.rasterize.ssim import l1_ssim_loss
 from splatart_ns.stages.camera_refinement import PASSES, camera_change, refine_cameras
 from splatart_ns.stages.exposure import at_gain, frame_gains
 from splatart_ns.stages.hull import carve, slack
-from splatart_ns.stages.seen_surface import LEAST_CONFIRMED
 from splatart_ns.stages.semantic import (
     accumulation_loss,
     ballots,

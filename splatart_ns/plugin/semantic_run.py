@@ -8,13 +8,13 @@ from pathlib import Path
 from torch import Tensor
 
 from splatart_ns.capture.capture import Capture
+from splatart_ns.capture.seen_surface import measured_surface
 from splatart_ns.capture.view import View, load_views
 from splatart_ns.errors import InputError
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint, run_setting
 from splatart_ns.plugin.gaussians import SPLAT_SHAPES, splat_from_state
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.exposure import at_gain
-from splatart_ns.stages.seen_surface import measured_surface
 from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
 
 _SHAPES = {

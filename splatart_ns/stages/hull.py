@@ -11,8 +11,8 @@ from torch import Tensor
 
 from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.hull import footprint, outermost, project, widened
+from splatart_ns.capture.seen_surface import SeenSurface, measured_surface
 from splatart_ns.capture.view import View
-from splatart_ns.stages.seen_surface import SeenSurface, measured_surface
 from splatart_ns.stages.stereo import stereo_surface
 
 MIN_POINTS_PER_PART = {2: 2000, 6: 1000}

@@ -15,10 +15,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from splatart_ns.capture.hull import footprint
+from splatart_ns.capture.seen_surface import SeenSurface, agreed, cells, grid, neighbours, object_pixels
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.rasterize.rasterization import has_numba
-from splatart_ns.stages.seen_surface import SeenSurface, agreed, cells, grid, neighbours, object_pixels
 
 PASSES = 3
 """With 5 places lie nearly as near the truth."""

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from splatart_ns.capture.digest import capture_digest
 from splatart_ns.capture.examination import as_json, as_text, examine
+from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.procedural import synthesize_object
 from splatart_ns.capture.synthesis_options import SynthesisOptions
 
@@ -209,3 +211,38 @@ def test_what_is_no_capture_is_one_problem(tmp_path):
     examination = examine(tmp_path)
     assert examination.capture is None and examination.errors == len(examination.problems) == 1
     assert as_text(examination).endswith("1 errors, 0 warnings")
+
+
+@pytest.fixture(scope="module")
+def deep(tmp_path_factory):
+    """A capture with depth, in counts of 0.0001."""
+    options = SynthesisOptions(train_views=16, test_views=1, resolution=64, depth=True)
+    return synthesize_object("hinge", tmp_path_factory.mktemp("deep") / "capture", options)
+
+
+@pytest.mark.parametrize("wrong", [1e-3, 1.0, 2e-5])
+def test_depth_of_a_wrong_unit_is_told_and_the_right_one_guessed(deep, tmp_path, wrong):
+    assert not examine(deep).problems
+    capture = shutil.copytree(deep, tmp_path / "capture")
+    change_json(capture / "state_01/transforms.json", lambda meta: meta.update(depth_unit_scale_factor=wrong))
+    (problem,) = examine(capture).problems
+    assert problem.severity == "warning" and problem.file.name == "state_01"
+    assert problem.message == "other frames confirm 0% of the frames' depth"
+    guess = float(problem.mend.split(" would be about ")[1].split(";")[0])
+    assert guess == pytest.approx(1e-4, rel=0.05)
+
+
+def test_depth_that_is_none_is_told_without_a_guess(deep, tmp_path):
+    capture = shutil.copytree(deep, tmp_path / "capture")
+    noise = np.random.default_rng(0)
+    change_all(capture / "state_00/depth", lambda d: (d * noise.uniform(0.3, 3, d.shape)).astype(np.uint16))
+    (problem,) = examine(capture).problems
+    assert problem.file.name == "state_00" and "take depth_file_path out" in problem.mend
+
+
+def test_the_unit_of_depth_belongs_to_what_a_capture_holds(deep, tmp_path):
+    first = load_capture(deep)
+    capture = shutil.copytree(deep, tmp_path / "capture")
+    assert capture_digest(load_capture(capture)) == capture_digest(first)
+    change_json(capture / "state_01/transforms.json", lambda meta: meta.update(depth_unit_scale_factor=1.0))
+    assert capture_digest(load_capture(capture)) != capture_digest(first)

@@ -6,10 +6,10 @@ import pytest
 import torch
 from part_scene import cameras
 
+from splatart_ns.capture.seen_surface import agreed, neighbours
 from splatart_ns.capture.view import View
 from splatart_ns.stages import stereo
 from splatart_ns.stages.hull import _places, seed_points, seen_surface, surface, visual_hull
-from splatart_ns.stages.seen_surface import agreed, neighbours
 from splatart_ns.stages.stereo import stereo_surface
 
 pytest.importorskip("numba", reason="stereo is found by numba kernels")

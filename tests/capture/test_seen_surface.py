@@ -4,9 +4,9 @@ import pytest
 import torch
 from part_scene import cameras
 
+from splatart_ns.capture.seen_surface import _normals, measured_surface
 from splatart_ns.capture.view import View
 from splatart_ns.stages.hull import seed_points, seen_surface, visual_hull
-from splatart_ns.stages.seen_surface import _normals, measured_surface
 from splatart_ns.stages.semantic import depth_loss
 
 PIXELS, RADIUS = 96, 0.6

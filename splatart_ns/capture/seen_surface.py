@@ -1,4 +1,4 @@
-"""The surface of an object as the views of one state see it: by their own depth here, by `stages.stereo` else."""
+"""The surface of an object as the views of one state see it: by their own depth, or by `stages.stereo`."""
 
 from __future__ import annotations
 
