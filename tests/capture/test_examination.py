@@ -240,6 +240,15 @@ def test_depth_that_is_none_is_told_without_a_guess(deep, tmp_path):
     assert problem.file.name == "state_00" and "take depth_file_path out" in problem.mend
 
 
+def test_depth_of_another_frame_is_named(deep, tmp_path):
+    capture = shutil.copytree(deep, tmp_path / "capture")
+    file = capture / "state_01/transforms.json"
+    change_json(file, lambda meta: meta["frames"][3].update(depth_file_path="depth/0010.png"))
+    (problem,) = examine(capture).problems
+    assert problem.file.name == "0010.png" and problem.severity == "warning"
+    assert " of the depth of images/0003.png, and 9" in problem.message
+
+
 def test_the_unit_of_depth_belongs_to_what_a_capture_holds(deep, tmp_path):
     first = load_capture(deep)
     capture = shutil.copytree(deep, tmp_path / "capture")
