@@ -51,6 +51,7 @@ def main(options: Options) -> None:
             shift = rng.uniform(-5, 5, 3)
             poses[:, :3, :3] = R @ poses[:, :3, :3]
             poses[:, :3, 3] = scale * poses[:, :3, 3] @ R.T + shift
+            meta["depth_unit_scale_factor"] = scale * meta.get("depth_unit_scale_factor", 1e-3)
             print(f"{file.parent.name}: scale {scale:.6f}")
         for frame, pose in zip(meta["frames"], poses, strict=True):
             frame["transform_matrix"] = pose.tolist()
