@@ -88,6 +88,12 @@ def test_gaussians_learn_from_depth(depth_capture_dir, semantic_trainer):
     assert float(halved["depth"]) == pytest.approx(float(losses["depth"]), rel=0.5)  # of another frame
 
 
+def test_depth_is_not_read_where_nothing_learns(depth_capture_dir, semantic_trainer):
+    config = semantic_trainer(depth_capture_dir).config.pipeline
+    pipeline = config.setup(device="cpu", test_mode="inference")
+    assert not pipeline.findings and "views" not in pipeline.datamanager.train_dataset.__dict__
+
+
 def test_depth_that_contradicts_itself_is_told_and_not_used(depth_capture_dir, semantic_trainer, tmp_path):
     capture = shutil.copytree(depth_capture_dir, tmp_path / "capture")
     file = capture / "state_00/transforms.json"
