@@ -112,7 +112,7 @@ def _write_sample(sample: Sample, folder: Path, states: int, unit: float) -> Non
     write_png(image, cv2.cvtColor(sample.rgba, cv2.COLOR_RGBA2BGRA))
 
 
-def _transforms(dataset: Dataset, indices: Iterable[int], depth_unit: float) -> dict[str, Any]:
+def _transforms(dataset: Dataset, indices: Iterable[int], unit: float) -> dict[str, Any]:
     bundle, states = dataset.splat.bundle, dataset.options.states
     frames, camera = [], None
     for index in indices:
@@ -132,7 +132,7 @@ def _transforms(dataset: Dataset, indices: Iterable[int], depth_unit: float) -> 
         **{"w": camera.width, "h": camera.height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy},
         **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
         "length_unit": bundle.length_unit,
-        "depth_unit_scale_factor": depth_unit,
+        "depth_unit_scale_factor": unit,
         "semantic_classes": ["background", *(names.get(i, f"part_{i}") for i in range(1, max(names) + 1))],
         "frames": frames,
     }

@@ -41,9 +41,6 @@ _WIDE_BAND, _SHIFTED_BAND = 0.02, 0.02
 """How far a labels' outline may lie from the silhouette's, as a share of the object's size: all frames, one frame."""
 _ONE_UNIT = 1.2
 """Depths are of another unit than told if half of their ratios to the hull's lie within this factor."""
-_ODD_DEPTH = 0.7
-"""A frame's depth is wrong if others confirm a smaller share of what they confirm of most: of another frame's depth
-half is confirmed by chance, of sound ones 0.89 and more."""
 _STAYS, _MOVES = 0.93, 0.6
 """A part rests from one state to another if so much of it is at the same place, and moves if less than the second; in
 between, another part may have moved before it."""
@@ -233,12 +230,10 @@ def _check_depth(capture: Capture, one: _Evidence) -> Iterator[Problem]:
     """Depth that contradicts itself from frame to frame, and what unit it seems to have."""
     measured = measured_surface(one.views)
     if measured.confirmed >= LEAST_CONFIRMED:
-        shares = [_confirmed(*pair) for pair in zip(one.views, measured.trusted_views(), strict=True)]
-        usual = float(np.median([share for share in shares if share is not None] or [0.0]))
-        for frame, share in zip(one.frames, shares, strict=True):
-            if share is not None and share < _ODD_DEPTH * usual:
-                found = f"other frames confirm {share:.0%} of the depth of {frame.name}, and {usual:.0%} of the others'"
-                yield Problem("warning", frame.depth, found, "correct it, its depth_file_path or the frame's pose")
+        for frame, view, trusted in zip(one.frames, one.views, measured.trusted_views(), strict=True):
+            if view.depth is not None and ((view.depth > 0) & object_pixels(view)).any() and not trusted.depth.any():
+                mend = "correct it, its depth_file_path or the frame's pose; it is not used"
+                yield Problem("warning", frame.depth, f"the depth of {frame.name} contradicts the other frames'", mend)
         return
     ratios = [_depth_ratio(view, one.points, one.size) for view in one.views if view.depth is not None]
     ratio = torch.cat([torch.zeros(0), *ratios])
@@ -248,12 +243,6 @@ def _check_depth(capture: Capture, one: _Evidence) -> Iterator[Problem]:
         mend = f"by the silhouettes depth_unit_scale_factor would be about {unit:.2g}; until it is, depth is not used"
     found = f"other frames confirm {measured.confirmed:.0%} of the frames' depth"
     yield Problem("warning", capture.path / one.state.name, found, mend)
-
-
-def _confirmed(view: View, trusted: View) -> float | None:
-    """The share of a view's depth that is trusted; None where it has none."""
-    known = None if view.depth is None else (view.depth > 0) & object_pixels(view)
-    return None if known is None or not known.any() else float((trusted.depth > 0)[known].float().mean())
 
 
 def _depth_ratio(view: View, points: Tensor, size: float) -> Tensor:

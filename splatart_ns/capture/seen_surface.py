@@ -31,6 +31,9 @@ _FREED_BY = 2
 """... in so many views."""
 LEAST_CONFIRMED = 0.3
 """Depths of which other views confirm a smaller share are of another unit, or of other cameras."""
+ODD = 0.7
+"""A view's depth is wrong if others confirm a smaller share of it than so much of the median view's: of another frame's
+depth half is confirmed by chance, of sound ones 0.89 and more."""
 _OBLIQUE = 0.15
 """Least cosine between a ray and the normal of what it meets; less is a step between two surfaces."""
 
@@ -89,7 +92,8 @@ class SeenSurface:
 
 
 def measured_surface(views: Sequence[View]) -> SeenSurface:
-    """What the depth of the views of a state says, where others say the same; nothing where it contradicts itself.
+    """What the depth of the views of a state says, where others say the same; nothing of views that contradict the
+    others, and nothing at all where most do.
 
     What lies beside the object, where they have an alpha, does not count.
     """
@@ -112,6 +116,12 @@ def measured_surface(views: Sequence[View]) -> SeenSurface:
     others = torch.zeros(len(views), nearest.shape[-1], dtype=torch.long)
     others[having] = nearest
     found = agreed(views, others, depth, normals, stride)
+    share = found.depth.isfinite().sum((1, 2)) / depth.isfinite().sum((1, 2)).clamp_min(1)
+    odd = torch.zeros_like(share) > 0
+    odd[having] = share[having] < ODD * share[having].median() if len(having) else False
+    if odd.any():  # what they confirmed of others, they confirmed by chance
+        depth[odd] = torch.inf
+        found = replace(agreed(views, others, depth, normals, stride), confirmed=found.confirmed)
     return found if found.confirmed >= LEAST_CONFIRMED else SeenSurface.nothing(views, found.confirmed)
 
 
