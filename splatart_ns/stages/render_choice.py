@@ -12,14 +12,18 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from splatart_ns.capture.view import View
+from splatart_ns.geometry.se3 import from_rotation_translation
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import PartPair, part_pair
-from splatart_ns.stages.refinement import increment, refine
+from splatart_ns.stages.refinement import Refinement, increment, refine
 from splatart_ns.stages.registration import MIN_POINTS, distinct, part_points, point_to_plane, register
 from splatart_ns.stages.shading import without_shading
+from splatart_ns.stages.symmetric_turns import symmetric_turns
 
 VIEWS = 5
 """Views of each state that are compared."""
+DOUBTFUL_VIEWS = 12
+"""So many where these leave the motion in doubt: what tells may show in few."""
 COARSE_PIXELS = 1500
 """Choosing needs no more pixels a view than this."""
 TINY_PIXELS = 400
@@ -102,24 +106,27 @@ def initial_motion(
     if coarse is None or fine is None:
         return InitialMotion(candidates[0], found=True)
     candidates = torch.cat([identity[None], candidates])
-    glance = appearance_cost(part_pair(splats, views, part, GLANCE_VIEWS, TINY_PIXELS), candidates)
+    tiny = part_pair(splats, views, part, GLANCE_VIEWS, TINY_PIXELS)
+    glance = appearance_cost(tiny, candidates)
     hopeful = candidates[torch.from_numpy(glance <= HOPELESS * glance.min())]
     closer = torch.from_numpy(point_to_plane(source, target, hopeful.numpy(force=True))).to(identity)
     everything, candidates = torch.cat([candidates, closer]), torch.cat([hopeful, closer])
-    candidates = choose(coarse, candidates, SIMILAR)
-    if float(coarse.cost(identity[None])[0]) < STILL_RATIO * float(coarse.cost(candidates[:1])[0]):
-        candidates = identity[None]
-    if len(candidates) > 1:
-        candidates = choose(coarse, torch.stack([refine(coarse, T, 5).T for T in candidates]), 1.5)
-    ends = [refine(fine, T, 10) for T in candidates]
+    chosen = choose(coarse, candidates, SIMILAR)
+    if float(coarse.cost(identity[None])[0]) < STILL_RATIO * float(coarse.cost(chosen[:1])[0]):
+        chosen = identity[None]
+    ends = refined(coarse, fine, chosen)
     if min(e.cost for e in ends) > SUSPECT * own_cost:
-        tiny = part_pair(splats, views, part, 3, TINY_PIXELS)
-        wide = torch.stack([search(tiny, T) for T in choose(coarse, everything, float("inf"), keep=5)])
+        small = part_pair(splats, views, part, 3, TINY_PIXELS)
+        wide = torch.stack([search(small, T) for T in choose(coarse, everything, float("inf"), keep=5)])
         ends += [refine(fine, T, 10) for T in choose(coarse, wide, 1.5)]
-    cost = appearance_cost(fine, torch.stack([e.T for e in ends]))
-    T = torch.stack([e.T for e in ends]).cpu().numpy()
-    order = prefer_slide(T, cost, distinct(T, cost, source.centroid, source.radius))
-    order = prefer_turn(T, cost, order, source.radius)
+    T, cost, order = ranked(fine, ends)
+    known = torch.from_numpy(T[order]).to(identity)
+    turned = turned_alike(tiny, coarse, known[0])
+    if len(turned) or any(looks_alike(T, cost, order[0], i) for i in order):
+        coarse, fine = (part_pair(splats, views, part, DOUBTFUL_VIEWS, n) for n in (COARSE_PIXELS, FINE_PIXELS))
+        identity_cost = float(fine.cost(identity[None])[0])
+        ends = refined(coarse, fine, choose(coarse, torch.cat([known, turned, candidates]), SIMILAR))
+        T, cost, order = ranked(fine, ends)
     best = ends[order[0]]
     identity_ratio = identity_cost / max(best.cost, 1e-12)
     still = identity_ratio < STILL_RATIO
@@ -131,6 +138,40 @@ def initial_motion(
         identity_ratio=identity_ratio,
         alike=() if still else tuple(ends[i].T for i in order if looks_alike(T, cost, order[0], i)),
     )
+
+
+def not_worse(pair: PartPair, candidates: Tensor, T: Tensor, factor: float) -> Tensor:
+    """The motions [K, 4, 4] of `candidates` [C, 4, 4] that cost at most `factor` times what T [4, 4] does."""
+    cost = appearance_cost(pair, torch.cat([T[None], candidates]))
+    return candidates[torch.from_numpy(cost[1:] <= factor * cost[0])]
+
+
+def turned_alike(tiny: PartPair, coarse: PartPair, T: Tensor) -> Tensor:
+    """Motions [K, 4, 4] other than T [4, 4] that a symmetric part, turned so that it looks alike, may have made.
+
+    Registration may have missed the right one of them.
+    """
+    R, centroid = symmetric_turns(coarse.splats[0]), coarse.centroid
+    turned = not_worse(tiny, T @ from_rotation_translation(R, centroid - R @ centroid), T, HOPELESS)
+    if len(turned) == 0:
+        return turned
+    turned = torch.stack([refine(coarse, near, 5).T for near in choose(coarse, turned, float("inf"))])
+    return not_worse(coarse, turned, T, ALIKE)
+
+
+def refined(coarse: PartPair, fine: PartPair, candidates: Tensor) -> list[Refinement]:
+    """The motions [C, 4, 4] refined on many pixels, of several those that render best once refined on few."""
+    if len(candidates) > 1:
+        candidates = choose(coarse, torch.stack([refine(coarse, T, 5).T for T in candidates]), 1.5)
+    return [refine(fine, T, 10) for T in candidates]
+
+
+def ranked(pair: PartPair, ends: Sequence[Refinement]) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Motions [C, 4, 4], what they cost [C], and the distinct ones of them in the order in which they are preferred."""
+    T = torch.stack([e.T for e in ends])
+    cost, T = appearance_cost(pair, T), T.cpu().numpy()
+    order = prefer_slide(T, cost, distinct(T, cost, pair.centroid.cpu().numpy(), pair.radius))
+    return T, cost, prefer_turn(T, cost, order, pair.radius)
 
 
 def looks_alike(T: np.ndarray, cost: np.ndarray, chosen: int, other: int) -> bool:

@@ -21,6 +21,7 @@ from splatart_ns.stages.refinement import refine
 from splatart_ns.stages.render_choice import (
     ALIKE,
     COARSE_PIXELS,
+    DOUBTFUL_VIEWS,
     FINE_PIXELS,
     SLIDE_TURN,
     VIEWS,
@@ -65,7 +66,8 @@ def slid_alike(
     """
     if len(ways) == 0:
         return motion
-    coarse, fine = (part_pair(splats, views, part, VIEWS, pixels) for pixels in (COARSE_PIXELS, FINE_PIXELS))
+    coarse = part_pair(splats, views, part, VIEWS, COARSE_PIXELS)
+    fine = part_pair(splats, views, part, DOUBTFUL_VIEWS, FINE_PIXELS)
     if coarse is None or fine is None:
         return motion
     far = coarse.radius * torch.arange(-REACH, REACH + STEP / 2, STEP).to(motion.T)

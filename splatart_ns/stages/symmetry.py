@@ -22,9 +22,8 @@ from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import CHROMA_WEIGHT, PartPair, part_pair
 from splatart_ns.stages.refinement import increment, refine
 from splatart_ns.stages.render_choice import COARSE_PIXELS, VIEWS
+from splatart_ns.stages.symmetric_turns import similar_axes
 
-SIMILAR_MOMENTS = 0.7
-"""Round parts have two principal moments whose ratio is above this."""
 MAYBE_ROUND = 0.03
 """Turning them about their principal axis raises the cost per pixel by less than this."""
 ROUND = 0.01
@@ -57,7 +56,7 @@ def settle_turn(
     """
     T = T.double()
     untold = torch.zeros(6, 6).to(T)
-    axes = _similar_axes(splats[0].select(splats[0].part_ids == part))
+    axes = similar_axes(splats[0].select(splats[0].part_ids == part))
     pair = part_pair(splats, views, part, VIEWS, COARSE_PIXELS) if len(axes) else None
     if pair is None:
         return T, untold
@@ -77,17 +76,6 @@ def settle_turn(
         elif min(best, len(cost) - best) * STEP > DIP:
             T = se3_exp(angles[best] * twist) @ T
     return T, untold
-
-
-def _similar_axes(splat: Splat) -> Tensor:
-    """The principal axes [K, 3] of a part about which it may be round: the moments across them are nearly equal."""
-    x, weight = splat.means.double(), splat.opacities.double()
-    if len(x) < 2:
-        return x[:0]
-    x = x - weight @ x / weight.sum()
-    moments, axes = torch.linalg.eigh((weight[:, None] * x).mT @ x / weight.sum())
-    across = torch.stack([moments[[1, 2]], moments[[0, 2]], moments[[0, 1]]])
-    return axes.mT[across[:, 0] > SIMILAR_MOMENTS * across[:, 1]]
 
 
 def _axis_of_symmetry(pair: PartPair, T: Tensor, axis: Tensor) -> Tensor | None:

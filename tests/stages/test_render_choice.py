@@ -4,6 +4,7 @@ import torch
 from part_scene import angle_deg, box, motion, photograph, two_states
 
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages import render_choice
 from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.registration import part_points, register
 from splatart_ns.stages.render_choice import choose, initial_motion, prefer_slide, prefer_turn
@@ -86,6 +87,21 @@ def test_the_other_turns_of_a_plain_square_part_are_told():
     turns = [angle_deg(found.T, other) for other in found.alike]
     assert any(abs(turn - 90) < 2 for turn in turns)
     assert all(min(abs(turn - quarter) for quarter in (90, 180)) < 2 for turn in turns)
+
+
+@pytest.mark.parametrize("views_at_first", [1, 5])  # one, from above or below, shows nothing of the sides
+def test_of_a_square_plate_painted_on_half_of_one_side_the_right_turn_is_found(monkeypatch, views_at_first):
+    T = motion((0, 0, 115), (0.2, 0.1, 0.0))
+    plate = box(1, (0.6, 0.6, 0.16), (0.0, 0.0, 0.0), spacing=0.05)
+    painted = (plate.means[:, 0] > 0.28) & (plate.means[:, 1] > 0)
+    plate.sh = torch.where(painted[:, None, None], plate.sh.new_tensor([1.0, -1.0, -1.0]), 0.0)
+    splats = plate, plate.transformed(T)
+    views = tuple(photograph(s, count=20) for s in splats)
+    seen = tuple(visibility(s, v) for s, v in zip(splats, views, strict=True))
+    monkeypatch.setattr(render_choice, "VIEWS", views_at_first)
+    found = initial_motion(splats, views, seen, part=1)
+    assert angle_deg(found.T, T) < 1
+    assert found.alike == ()
 
 
 def test_a_still_part_does_not_move_at_all(scene):
