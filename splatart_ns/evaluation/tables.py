@@ -73,10 +73,10 @@ def _known(values: dict[str, Any]) -> list[bool]:
 
 def _table(title: str, names: list[str], columns: dict[str, str], rows: list[tuple]) -> Table:
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-    for name in names:
-        table.add_column(name, no_wrap=True)
+    for k, name in enumerate(names):
+        table.add_column(name, overflow="fold", no_wrap=k > 0)
     for header in columns.values():
-        table.add_column(header, justify="right")
+        table.add_column(header, justify="right", no_wrap=True)  # a figure cut short says something else
     for *labels, values in rows:
         # As plain text: names may hold what rich takes for markup.
         table.add_row(*map(Text, labels), *(_shown(values[key]) for key in columns))

@@ -30,7 +30,7 @@ from splatart_ns.stages.joint_constraint import JointConstraint, required_parent
 from splatart_ns.stages.joint_fit import JointFit, free_joint
 from splatart_ns.stages.joint_pairs import descend_pairs, fit_pairs, stood_still, surface_error, told_pair
 from splatart_ns.stages.tree_refinement import refine_tree
-from splatart_ns.stages.unseen import known_states, may_have_turned, place_unseen
+from splatart_ns.stages.unseen import known_states, leads_blindly, may_have_turned, place_unseen
 
 JointMethod = Literal["screw", "descent"]
 _SEEN_NOISE = 0.3
@@ -114,7 +114,7 @@ def infer_tree(
         told = told_pair(c, joints, pair, motions, radius, **certainty)
         joints = {edge: fit for edge, fit in joints.items() if set(edge) != set(pair)} | told
     # A part of which nothing tells where it is at state 0 hangs on others, and nothing hangs on it.
-    joints = {(a, b): fit for (a, b), fit in joints.items() if a not in lost}
+    joints = {(a, b): fit for (a, b), fit in joints.items() if a not in lost and not leads_blindly(known[a], known[b])}
     contacts = find_contacts(points, motions, {_pair(*edge) for edge, fit in joints.items() if fit.accepted}, known)
     groups = _free_groups(points, motions, joints, contacts, root, radius, required)
     contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups})

@@ -30,6 +30,12 @@ def may_have_turned(covariances: Tensor) -> Tensor:
     return torch.linalg.eigvalsh(rotation)[..., -1] > UNSEEN_ROTATION**2
 
 
+def leads_blindly(known_a: Tensor, known_b: Tensor) -> bool:
+    """Whether part b was seen in states in which part a was not, and a joint to a would say nothing of its motion: no
+    two states show both [S]."""
+    return int((known_a & known_b).sum()) < 2 and bool((known_b & ~known_a).any())
+
+
 def relative_motion(T_a: Tensor, T_b: Tensor, known_a: Tensor, known_b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """How part b moves relative to part a, from their motions [S, 4, 4] and what is known of them [S].
 

@@ -179,6 +179,31 @@ def test_a_part_in_one_state_only_is_an_error(capture_folder):
     ]
 
 
+def with_handle(capture_folder, edit):
+    """Give a third part the upper half of the door in state 0 and of the base in state 1, where nothing is the door."""
+    for k, owner in enumerate((2, 1)):
+        state = capture_folder / f"state_0{k}"
+        edit(state / "transforms.json", lambda m: m.update(semantic_classes=["background", "base", "door", "handle"]))
+        for file in state.glob("labels/*.png"):
+            labels = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+            rows = np.flatnonzero((labels == owner).any(1))
+            upper = np.arange(len(labels))[:, None] < rows.mean()
+            labels[(labels == owner) & upper] = 3
+            labels[labels == 2] = 2 if k == 0 else 1
+            put(file, labels)
+
+
+def test_a_part_hidden_in_a_state_of_which_all_frames_are_labelled_is_a_warning(capture_folder, edit):
+    with_handle(capture_folder, edit)
+    told = ["capture: part 2 (door) is not labelled in state_01, so its motion cannot be known there"]
+    problems = check_capture(capture_folder)
+    assert found(problems) == []
+    assert found(problems, "warning") == told
+
+    edit(capture_folder / "state_01/transforms.json", lambda m: m["frames"][0].pop("semantics_path"))
+    assert found(check_capture(capture_folder)) == told  # that frame may show it
+
+
 def test_a_part_that_is_never_labelled_is_an_error(capture_folder):
     for k in range(2):
         relabel(capture_folder / f"state_0{k}", 2, 1)

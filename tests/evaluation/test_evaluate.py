@@ -17,8 +17,8 @@ def folder(bundle, tmp_path):
     return tmp_path / "out"
 
 
-def printed(metrics) -> str:
-    console = Console(width=200, record=True, file=io.StringIO())
+def printed(metrics, width: int = 200) -> str:
+    console = Console(width=width, record=True, file=io.StringIO())
     for item in format_tables(metrics):
         console.print(item)
     return console.export_text()
@@ -44,6 +44,17 @@ def test_a_perfect_estimate_scores_perfectly(folder, capture):
         assert scores["part_iou"] > 0.98
     assert metrics["speed"] == {"stages": {"semantic": {"seconds": 1.5}}}
     assert json.loads((folder / "metrics.json").read_text())["joints"] == metrics["joints"]
+
+
+def test_a_long_name_is_broken_and_no_figure_cut_short(folder, capture):
+    metrics = evaluate(folder, capture)
+    metrics["joints"] = [
+        {**joint, "child": "right_front_outer_knuckle", "axis_angle": 1 / 8091} for joint in metrics["joints"]
+    ]
+    lines = printed(metrics, 80).splitlines()
+    assert max(map(len, lines)) <= 80
+    assert not any("…" in line for line in lines)
+    assert sum("0.000124" in line for line in lines) == len(metrics["joints"])
 
 
 def test_a_wrong_motion_shows_in_the_images_of_its_state(bundle, folder, capture):

@@ -72,6 +72,17 @@ def test_a_part_seen_in_one_state_alone_has_no_joint_that_is_sure():
     assert fit.type == "fixed" and len(fit.undetermined) == 2
 
 
+def test_what_moved_does_not_hang_on_a_part_that_was_not_seen_when_it_did():
+    points, motions, covariances = scene(turntable=False)
+    points[4] = transform_points(motion((0, 0, 0), (-0.05, 0, 0)), points[4])  # in touch with the door
+    motions = {p: T[:2] for p, T in motions.items()} | {4: EYE.repeat(2, 1, 1)}
+    covariances = {p: C[:2].clone() for p, C in covariances.items()}
+    covariances[4] = covariances[1].clone().index_fill(0, torch.tensor(1), torch.nan)
+    joints = {j.child: j for j in infer_tree(points, motions, covariances=covariances, root=1).joints}
+    assert joints[3].parent != 4 and joints[3].fit.type == "revolute"
+    assert joints[4].fit.type == "fixed" and joints[4].fit.ambiguous
+
+
 def test_in_a_later_state_that_hides_a_part_it_moves_with_its_parent():
     a = torch.stack([EYE, motion((0, 0, 20), (0, 0, 0)), motion((0, 0, 50), (0.1, 0, 0))])
     slide = torch.stack([motion((0, 0, 0), (x, 0, 0)) for x in (0.0, 0.3, 0.1)])
