@@ -121,8 +121,9 @@ def initial_motion(
         ends += [refine(fine, T, 10) for T in choose(coarse, wide, 1.5)]
     T, cost, order = ranked(fine, ends)
     known = torch.from_numpy(T[order]).to(identity)
-    turned = turned_alike(tiny, coarse, known[0])
-    if len(turned) or any(looks_alike(T, cost, order[0], i) for i in order):
+    moved = identity_cost >= STILL_RATIO * ends[order[0]].cost
+    turned = turned_alike(tiny, coarse, known[0]) if moved else known[:0]
+    if len(turned) or moved and any(looks_alike(T, cost, order[0], i) for i in order):
         coarse, fine = (part_pair(splats, views, part, DOUBTFUL_VIEWS, n) for n in (COARSE_PIXELS, FINE_PIXELS))
         identity_cost = float(fine.cost(identity[None])[0])
         ends = refined(coarse, fine, choose(coarse, torch.cat([known, turned, candidates]), SIMILAR))
@@ -140,23 +141,21 @@ def initial_motion(
     )
 
 
-def not_worse(pair: PartPair, candidates: Tensor, T: Tensor, factor: float) -> Tensor:
-    """The motions [K, 4, 4] of `candidates` [C, 4, 4] that cost at most `factor` times what T [4, 4] does."""
-    cost = appearance_cost(pair, torch.cat([T[None], candidates]))
-    return candidates[torch.from_numpy(cost[1:] <= factor * cost[0])]
-
-
 def turned_alike(tiny: PartPair, coarse: PartPair, T: Tensor) -> Tensor:
-    """Motions [K, 4, 4] other than T [4, 4] that a symmetric part, turned so that it looks alike, may have made.
+    """Motions [K, 4, 4] quite other than T [4, 4] that a symmetric part, turned so that it looks alike, may have made.
 
     Registration may have missed the right one of them.
     """
     R, centroid = symmetric_turns(coarse.splats[0]), coarse.centroid
-    turned = not_worse(tiny, T @ from_rotation_translation(R, centroid - R @ centroid), T, HOPELESS)
+    turned = torch.cat([T[None], T @ from_rotation_translation(R, centroid - R @ centroid)])
+    cost = appearance_cost(tiny, turned)
+    turned = turned[1:][torch.from_numpy(cost[1:] <= HOPELESS * cost[0])]
     if len(turned) == 0:
         return turned
-    turned = torch.stack([refine(coarse, near, 5).T for near in choose(coarse, turned, float("inf"))])
-    return not_worse(coarse, turned, T, ALIKE)
+    nearest = [refine(coarse, near, 5).T for near in choose(coarse, turned, float("inf"))]
+    ends = torch.stack([T, *nearest])
+    cost, motions = appearance_cost(coarse, ends), ends.cpu().numpy()
+    return ends[[i for i in range(len(ends)) if looks_alike(motions, cost, 0, i)]]
 
 
 def refined(coarse: PartPair, fine: PartPair, candidates: Tensor) -> list[Refinement]:

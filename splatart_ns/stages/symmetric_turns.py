@@ -14,6 +14,8 @@ SIMILAR_MOMENTS = 0.7
 """Round parts, and square ones, have two principal moments whose ratio is above this."""
 STEP = 15
 """Degrees between the turns about an axis across which they are similar: quarter, sixth and eighth turns are such."""
+LEAST = 45
+"""Least of these; from smaller ones refining finds the way back."""
 OVER_STEP = 5
 """Degrees between the axes across it about which it is turned over, as these are not those of its edges."""
 
@@ -33,7 +35,7 @@ def symmetric_turns(splat: Splat) -> Tensor:
     axes, similar = _principal_axes(splat)
     turns = [math.pi * axes]
     for k in similar.nonzero()[:, 0].tolist():
-        around = torch.arange(STEP, 360, STEP).to(axes).deg2rad()
+        around = torch.arange(LEAST, 360 - LEAST + 1, STEP).to(axes).deg2rad()
         over = torch.arange(0, 180, OVER_STEP).to(axes).deg2rad()[:, None]
         turns += [around[:, None] * axes[k], math.pi * (over.cos() * axes[k - 1] + over.sin() * axes[k - 2])]
     return so3_exp(torch.cat(turns))
