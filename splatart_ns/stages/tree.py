@@ -96,7 +96,8 @@ def infer_tree(
     lost = {p for p in points if not known[p][0]}
     if root is None:
         free = set(points) - set(required)
-        free = free - lost or free
+        # Of what is not seen in all states it is not known that it rests.
+        free = {p for p in free if known[p].all()} or free - lost or free
         if any(stood_still(p, motions, covariances) for p in free):
             free = {p for p in free if covariances is None or not may_have_turned(covariances[p]).any()}
         root = choose_root({p: points[p] for p in free}, motions, radius, noise)
@@ -114,7 +115,9 @@ def infer_tree(
         told = told_pair(c, joints, pair, motions, radius, **certainty)
         joints = {edge: fit for edge, fit in joints.items() if set(edge) != set(pair)} | told
     # A part of which nothing tells where it is at state 0 hangs on others, and nothing hangs on it.
-    joints = {(a, b): fit for (a, b), fit in joints.items() if a not in lost and not leads_blindly(known[a], known[b])}
+    joints = {(a, b): fit for (a, b), fit in joints.items() if a not in lost}
+    blind = {(a, b) for a, b in joints if leads_blindly(known[a], known[b]) and required.get(b) != a}
+    joints = {edge: fit for edge, fit in joints.items() if edge not in blind}
     contacts = find_contacts(points, motions, {_pair(*edge) for edge, fit in joints.items() if fit.accepted}, known)
     groups = _free_groups(points, motions, joints, contacts, root, radius, required)
     contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups})

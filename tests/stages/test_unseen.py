@@ -3,6 +3,7 @@ import torch
 from part_scene import box, motion
 
 from splatart_ns.geometry.se3 import inverse, transform_points
+from splatart_ns.stages.joint_constraint import JointConstraint
 from splatart_ns.stages.tree import infer_tree
 from splatart_ns.stages.unseen import place_unseen, relative_motion
 
@@ -72,15 +73,34 @@ def test_a_part_seen_in_one_state_alone_has_no_joint_that_is_sure():
     assert fit.type == "fixed" and len(fit.undetermined) == 2
 
 
-def test_what_moved_does_not_hang_on_a_part_that_was_not_seen_when_it_did():
+def hidden_after_state_0():
+    """The scene's first two states; the drawer, in touch with the door, is not seen in the second."""
     points, motions, covariances = scene(turntable=False)
-    points[4] = transform_points(motion((0, 0, 0), (-0.05, 0, 0)), points[4])  # in touch with the door
+    points[4] = transform_points(motion((0, 0, 0), (-0.05, 0, 0)), points[4])
     motions = {p: T[:2] for p, T in motions.items()} | {4: EYE.repeat(2, 1, 1)}
     covariances = {p: C[:2].clone() for p, C in covariances.items()}
     covariances[4] = covariances[1].clone().index_fill(0, torch.tensor(1), torch.nan)
+    return points, motions, covariances
+
+
+def test_what_moved_does_not_hang_on_a_part_that_was_not_seen_when_it_did():
+    points, motions, covariances = hidden_after_state_0()
     joints = {j.child: j for j in infer_tree(points, motions, covariances=covariances, root=1).joints}
     assert joints[3].parent != 4 and joints[3].fit.type == "revolute"
     assert joints[4].fit.type == "fixed" and joints[4].fit.ambiguous
+
+
+def test_but_it_does_if_the_user_says_so():
+    points, motions, covariances = hidden_after_state_0()
+    told = [JointConstraint(4, 3)]
+    tree = infer_tree(points, motions, covariances=covariances, root=1, constraints=told)
+    assert {j.child: j.parent for j in tree.joints}[3] == 4
+
+
+def test_a_part_that_a_state_hides_is_not_the_root_though_it_is_the_largest():
+    points, motions, covariances = hidden_after_state_0()
+    points[4] = 3 * points[4]
+    assert infer_tree(points, motions, covariances=covariances).root in (1, 2)
 
 
 def test_in_a_later_state_that_hides_a_part_it_moves_with_its_parent():
