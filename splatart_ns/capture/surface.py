@@ -140,6 +140,8 @@ def merge_coincident(surface: Surface) -> Surface:
 
 def smooth_normals(corners: np.ndarray, crease_degrees: float = 35.0) -> np.ndarray:
     """Corner normals [F, 3, 3]: the mean, by area, over the faces at that point that bend less than a crease."""
+    if len(corners) == 0:
+        return corners
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face = np.repeat(np.arange(len(corners)), 3)
     unit = doubled / np.linalg.norm(doubled, axis=-1, keepdims=True)

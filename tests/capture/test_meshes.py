@@ -35,6 +35,18 @@ def test_a_missing_texture_is_named_in_a_warning(tmp_path, caplog):
     assert "gone.png" in caplog.text
 
 
+def test_a_material_whose_triangles_all_lack_area_is_left_out(tmp_path):
+    path = write_obj(tmp_path)
+    path.write_text(path.read_text() + "usemtl grey\nf 1/1 2/2 2/2\n")
+    assert len(load_mesh(path).corners) == 2
+
+
+def test_a_mesh_whose_triangles_all_lack_area_is_refused(tmp_path):
+    (tmp_path / "flat.obj").write_text(OBJ + "f 1 2 2\n")
+    with pytest.raises(InputError, match="flat.obj: the mesh holds no triangles"):
+        load_mesh(tmp_path / "flat.obj")
+
+
 @pytest.mark.parametrize("texture_coordinates", [True, False])
 def test_a_mesh_without_material_takes_the_given_colour(tmp_path, texture_coordinates):
     face = "f 1/1 2/2 3/3\n" if texture_coordinates else "f 1 2 3\n"
