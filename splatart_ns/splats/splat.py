@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from splatart_ns.geometry.se3 import quat_from_matrix, quat_multiply
+from splatart_ns.geometry.se3 import matrix_from_quat, quat_from_matrix, quat_multiply
 from splatart_ns.geometry.spherical_harmonics import rotate_sh
 
 
@@ -56,6 +57,13 @@ class Splat:
     def part_ids(self) -> Tensor:
         """The most likely part of each Gaussian [N], 0 for background."""
         return self._logits().argmax(-1)
+
+    def ends(self, extent: float) -> Tensor:
+        """Where Gaussians end [N, 4, 3]: `extent` standard deviations out, both ways along their two longest axes."""
+        lengths, order = self.scales.sort(dim=-1, descending=True)
+        axes = matrix_from_quat(F.normalize(self.quats, dim=-1)).mT.gather(1, order[..., None].expand(-1, -1, 3))
+        along = (extent * lengths[..., None] * axes)[:, :2]
+        return torch.cat([self.means[:, None] + along, self.means[:, None] - along], 1)
 
     def _logits(self) -> Tensor:
         if self.part_logits is None:

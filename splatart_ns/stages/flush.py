@@ -11,14 +11,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.hull import project
 from splatart_ns.capture.view import View, box
-from splatart_ns.geometry.se3 import inverse, matrix_from_quat
+from splatart_ns.geometry.se3 import inverse
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.covisibility import share_left
@@ -96,14 +95,11 @@ def in_sight(splat: Splat, views: Sequence[View], depths: Sequence[Tensor], part
     The others reach, as nothing kept them from it, into what no view shows, and are seen to when the part moves. An end
     that a labelled view shows on another part is not in it.
     """
-    lengths, order = splat.scales.sort(dim=-1, descending=True)
-    axes = matrix_from_quat(F.normalize(splat.quats, dim=-1)).mT.gather(1, order[..., None].expand(-1, -1, 3))
-    along = (EXTENT * lengths[..., None] * axes)[:, :2]
-    ends = torch.cat([splat.means[:, None] + along, splat.means[:, None] - along], 1)
+    ends, thickness = splat.ends(EXTENT), splat.scales.amin(-1, keepdim=True)
     seen = torch.zeros(ends.shape[:2], dtype=torch.bool, device=ends.device)
     for view, depth in zip(views, depths, strict=True):
         column, row, z, inside = project(view, ends)
-        inside &= z <= depth[row, column] + TOLERANCE * (z / view.K[0, 0] + lengths[:, 2:])
+        inside &= z <= depth[row, column] + TOLERANCE * (z / view.K[0, 0] + thickness)
         if view.labels is not None:
             label = view.labels[row, column]
             inside &= (label == part) | (label == 0) | (label == UNLABELLED)

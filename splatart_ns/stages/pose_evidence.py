@@ -15,6 +15,7 @@ from splatart_ns.geometry.se3 import inverse, so3_log, transform_points
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.covisibility import compared_by_common, covisible
 from splatart_ns.stages.flush import compared_by_seen, in_sight, is_flush, surface_depths, without_neighbours
+from splatart_ns.stages.free_space import FreeSpace, without_haze
 from splatart_ns.stages.joint import PRISMATIC_BELOW
 from splatart_ns.stages.part_pair import CHROMA_WEIGHT, PartPair, part_pair
 from splatart_ns.stages.refinement import motion_covariance, refine, rotation_held_ratio, shifted
@@ -51,7 +52,7 @@ def refine_poses(
     up for. So parts whose images fit a mere shift as well are held to that.
 
     Parts are compared by what both states show of them (see `covisibility`); what lies flush with others, also by where
-    these show that it is not (see `flush`).
+    these show that it is not (see `flush`), and other parts, once about right, without haze (see `free_space`).
 
     Args:
         splats: One labelled splat per state.
@@ -72,6 +73,7 @@ def refine_poses(
     clear = clear or [clearest(*state) for state in zip(splats, views, strict=True)]
     common = [covisible(*((x[0], x[s]) for x in (splats, views, clear)), T[s]) for s in range(1, S)]
     depths = cache(lambda s: surface_depths(splats[s], views[s]))
+    free = cache(lambda s: FreeSpace.of(views[s]))
     for p in range(P):
         refined, slides = 0, {}
         flush = [is_flush(some, p + 1) for some in views]
@@ -92,6 +94,9 @@ def refine_poses(
                 pair = compared_by_seen(pair, T[s, p], seen)
             if not frozen[s, p]:
                 found = refine(pair, T[s, p], MAX_ITERATIONS, central=central)
+                clearer = pair if flush[0] or flush[s] else without_haze(pair, found.T, (free(0), free(s)))
+                if clearer is not pair:
+                    pair, found = clearer, refine(clearer, found.T, MAX_ITERATIONS, central=central)
                 T[s, p], equations = found.T, found.equations
             turned, untold = settle_turn((splats[0], splats[s]), (views[0], views[s]), p + 1, T[s, p])
             if not torch.equal(turned, T[s, p]):

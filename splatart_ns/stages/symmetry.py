@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.view import View
-from splatart_ns.geometry.se3 import inverse, se3_exp, se3_log
+from splatart_ns.geometry.se3 import inverse, se3_exp, se3_log, skew, so3_log
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import CHROMA_WEIGHT, PartPair, part_pair
 from splatart_ns.stages.refinement import increment, refine
@@ -36,6 +36,8 @@ TOLD = 1.05
 """Beyond, they cost at least this many times the best where the images tell the turn: else it may be noise."""
 TOLD_SHARE = 0.05
 """And by this share of what the worst costs more: else it may be light, whose wide dips measured 0.02 at most."""
+UNTURNED = 5
+"""Degrees by which a part that turned about its axis of symmetry alone may seem to have turned about others."""
 
 
 def settle_turn(
@@ -50,8 +52,8 @@ def settle_turn(
         T: Its motion [4, 4], near the optimum but for that turn.
 
     Returns:
-        The motion [4, 4] after the best turn, not refined: T itself where the part is not round, T fits best already,
-        or nothing tells. And the covariance [6, 6] of the turns that nothing tells, 0 where there are none: that of a
+        The motion [4, 4] after the best turn, not refined: T itself where the part is not round or T fits best already,
+        and where nothing tells, a mere shift if one of the turns makes it that. And the covariance [6, 6] of the turns that nothing tells, 0 where there are none: that of a
         uniform angle, pi^2 / 3, in the tangent of `motion_covariance`.
     """
     T = T.double()
@@ -73,9 +75,20 @@ def settle_turn(
         told = rival > TOLD * cost[best] and rival - cost[best] > TOLD_SHARE * (cost.amax() - cost[best])
         if not told:
             untold = untold + math.pi**2 / 3 * twist.outer(twist)
+            back = se3_exp(_least_turn(T, twist) * twist) @ T
+            T = back if so3_log(back[:3, :3]).norm() < math.radians(UNTURNED) else T
         elif min(best, len(cost) - best) * STEP > DIP:
             T = se3_exp(angles[best] * twist) @ T
     return T, untold
+
+
+def _least_turn(T: Tensor, twist: Tensor) -> Tensor:
+    """The angle about a twist [6] of unit rotation after which a motion T [4, 4] turns least.
+
+    About the axis w it makes the trace of exp(angle [w]x) R largest: w^T R w + cos (tr R - w^T R w) + sin tr([w]x R).
+    """
+    R, w = T[:3, :3], twist[3:]
+    return torch.atan2((skew(w) @ R).trace(), R.trace() - w @ R @ w)
 
 
 def _axis_of_symmetry(pair: PartPair, T: Tensor, axis: Tensor) -> Tensor | None:

@@ -1,0 +1,91 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from part_scene import box, motion, photograph
+
+from splatart_ns.geometry.se3 import inverse, se3_log
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages import pose_evidence
+from splatart_ns.stages.free_space import FreeSpace, without_haze
+from splatart_ns.stages.part_pair import part_pair
+from splatart_ns.stages.pose_evidence import refine_poses
+
+MOTION = motion((0.0, 0.0, -40.0), (0.05, 0.1, 0.0))
+POSES = torch.eye(4).double().repeat(2, 2, 1, 1)
+POSES[1, 1] = MOTION
+COUNT = 15
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A base (part 1) and a plate (part 2) that turns: splats, of which the first has haze at an edge of the plate, and
+    views, which show none."""
+    base = box(1, (0.9, 0.6, 0.3), (0.0, 0.0, -0.3))
+    plate = box(2, (0.7, 0.4, 0.12), (0.1, 0.0, 0.2))
+    row = torch.linspace(-0.2, 0.2, COUNT)
+    haze = replace(
+        plate.select(torch.arange(COUNT)),
+        means=torch.stack([torch.full_like(row, -0.38), row, torch.full_like(row, 0.2)], -1),
+        log_scales=torch.full((COUNT, 3), math.log(0.05)),
+        opacity_logits=torch.full((COUNT,), 0.0),
+    )
+    clean = Splat.cat([base, plate]), Splat.cat([base, plate.transformed(MOTION)])
+    return (Splat.cat([clean[0], haze]), clean[1]), tuple(photograph(s, 24, 96) for s in clean)
+
+
+def test_gaussians_that_end_in_the_background_of_some_view_reach_free_space(scene):
+    splats, views = scene
+    reached = FreeSpace.of(views[0]).reached_by(splats[0])
+    assert reached[-COUNT:].all()
+    assert not reached[:-COUNT].any()
+
+
+@pytest.mark.parametrize("without", ["alpha", "labels"])
+def test_labels_or_silhouettes_alone_tell_what_is_empty(scene, without):
+    splats, views = scene
+    space = FreeSpace.of([replace(v, **{without: None}) for v in views[0]])
+    reached = space.reached_by(splats[0])
+    assert reached[-COUNT:].all()
+    assert not reached[:-COUNT].any()
+
+
+def test_views_that_tell_no_background_show_nothing_to_be_empty(scene):
+    splats, views = scene
+    assert not FreeSpace.of([replace(v, alpha=None, labels=None) for v in views[0]]).reached_by(splats[0]).any()
+
+
+def test_of_many_views_some_are_asked(scene):
+    _, views = scene
+    assert len(FreeSpace.of(views[0] * 10).views) == 40
+
+
+def test_a_pair_is_compared_without_haze(scene):
+    splats, views = scene
+    pair = part_pair(splats, views, 2, 10, 10**6, near=True)
+    free = FreeSpace.of(views[0]), FreeSpace.of(views[1])
+    clearer = without_haze(pair, MOTION, free)
+    torch.testing.assert_close(clearer.splats[0].means, pair.splats[0].means[:-COUNT])
+    assert len(clearer.splats[1]) == len(pair.splats[1])
+    assert without_haze(clearer, MOTION, free) is clearer
+
+
+def test_where_the_motion_is_quite_wrong_nothing_counts_as_haze(scene):
+    splats, views = scene
+    pair = part_pair(splats, views, 2, 10, 10**6, near=True)
+    far = motion((0.0, 0.0, 0.0), (0.9, 0.0, 0.0)) @ MOTION
+    assert without_haze(pair, far, tuple(map(FreeSpace.of, views))) is pair
+
+
+def test_haze_at_one_edge_pulls_no_part(scene, monkeypatch):
+    splats, views = scene
+    frozen = torch.tensor([[True, True], [True, False]])
+
+    def error():
+        T, _ = refine_poses(splats, views, POSES, frozen)
+        return float(se3_log(inverse(MOTION) @ T[1, 1]).norm())
+
+    clear = error()
+    monkeypatch.setattr(pose_evidence, "without_haze", lambda pair, T, free: pair)
+    assert clear < 0.5 * error()
