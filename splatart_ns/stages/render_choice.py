@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from splatart_ns.capture.view import View
-from splatart_ns.geometry.se3 import from_rotation_translation
+from splatart_ns.geometry.se3 import from_rotation_translation, so3_log
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import PartPair, part_pair
-from splatart_ns.stages.refinement import Refinement, increment, refine
+from splatart_ns.stages.refinement import Refinement, increment, refine, shifted
 from splatart_ns.stages.registration import MIN_POINTS, distinct, part_points, point_to_plane, register
 from splatart_ns.stages.shading import without_shading
 from splatart_ns.stages.symmetric_turns import symmetric_turns
@@ -47,6 +47,8 @@ SEARCH_STEPS = (0.6, 0.3, 0.15, 0.08)
 """Steps of that search: part radii, and radians."""
 SLIDE_TURN = 6.0
 """Degrees by which a slide may seem to turn."""
+TURNED_OVER = math.radians(90)
+"""To a motion that turns a part by more a slide is preferred that fits nearly as well."""
 PITCHED, UNPITCHED = 0.1, 0.03
 """A motion that shifts a part by more than the first along its axis, in part radii, is no mere turn; one that shifts it
 by less than the second is."""
@@ -159,10 +161,15 @@ def turned_alike(tiny: PartPair, coarse: PartPair, T: Tensor) -> Tensor:
 
 
 def refined(coarse: PartPair, fine: PartPair, candidates: Tensor) -> list[Refinement]:
-    """The motions [C, 4, 4] refined on many pixels, of several those that render best once refined on few."""
+    """The motions [C, 4, 4] refined on many pixels, of several those that render best once refined on few.
+
+    If the best turns the part over, a mere shift to the same place comes last, for `prefer_slide`.
+    """
     if len(candidates) > 1:
         candidates = choose(coarse, torch.stack([refine(coarse, T, 5).T for T in candidates]), 1.5)
-    return [refine(fine, T, 10) for T in candidates]
+    ends = [refine(fine, T, 10) for T in candidates]
+    best = min(ends, key=lambda end: end.cost)
+    return [*ends, shifted(fine, best.T)] if so3_log(best.T[:3, :3]).norm() > TURNED_OVER else ends
 
 
 def ranked(pair: PartPair, ends: Sequence[Refinement]) -> tuple[np.ndarray, np.ndarray, list[int]]:
@@ -203,9 +210,9 @@ def prefer_slide(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]
 
     Where one state hides most of a part, no motion fits well: a drawer was seen to render a tenth better turned over.
     """
-    turn = np.degrees(np.arccos(((np.einsum("cii->c", T[:, :3, :3]) - 1) / 2).clip(-1, 1)))
-    slides = [i for i in order if turn[i] < SLIDE_TURN and cost[i] < STILL_RATIO * cost[order[0]]]
-    if turn[order[0]] < 90 or not slides:
+    turn = np.arccos(((np.einsum("cii->c", T[:, :3, :3]) - 1) / 2).clip(-1, 1))
+    slides = [i for i in order if turn[i] < math.radians(SLIDE_TURN) and cost[i] < STILL_RATIO * cost[order[0]]]
+    if turn[order[0]] < TURNED_OVER or not slides:
         return order
     return [slides[0], *(i for i in order if i != slides[0])]
 

@@ -53,8 +53,9 @@ def settle_turn(
 
     Returns:
         The motion [4, 4] after the best turn, not refined: T itself where the part is not round or T fits best already,
-        and where nothing tells, a mere shift if one of the turns makes it that. And the covariance [6, 6] of the turns that nothing tells, 0 where there are none: that of a
-        uniform angle, pi^2 / 3, in the tangent of `motion_covariance`.
+        and where nothing tells, a mere shift if one of the turns makes it that. And the covariance [6, 6] of the turns
+        that nothing tells, 0 where there are none: that of a uniform angle, pi^2 / 3, in the tangent of
+        `motion_covariance`.
     """
     T = T.double()
     untold = torch.zeros(6, 6).to(T)

@@ -7,7 +7,7 @@ from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import render_choice
 from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.registration import part_points, register
-from splatart_ns.stages.render_choice import choose, initial_motion, prefer_slide, prefer_turn
+from splatart_ns.stages.render_choice import choose, initial_motion, prefer_slide, prefer_turn, ranked, refined
 from splatart_ns.stages.visibility import visibility
 
 TRUTH = motion((0, 0, 70), (0.3, 0.2, 0.1))
@@ -154,3 +154,16 @@ def test_a_slide_that_fits_nearly_as_well_is_preferred_to_turning_over():
     assert prefer_slide(T, np.array([1.0, 1.05, 1.15]), [0, 1, 2]) == [2, 0, 1]
     assert prefer_slide(T, np.array([1.0, 1.05, 1.3]), [0, 1, 2]) == [0, 1, 2]
     assert prefer_slide(T, np.array([1.1, 1.0, 1.15]), [1, 0, 2]) == [1, 0, 2]
+
+
+def test_where_all_candidates_turn_the_part_over_a_mere_shift_is_tried():
+    slide = motion((0, 0, 0), (0.3, 0.2, 0.1))
+    splats, views = two_states(slide)
+    pair = part_pair(splats, views, 2, num_views=3, pixels=400)
+    over = motion((180, 0, 0), (0, 0, 0))
+    over[:3, 3] = pair.centroid - over[:3, :3] @ pair.centroid
+    ends = refined(pair, pair, (slide @ over)[None])
+    T, _, order = ranked(pair, ends)
+    assert np.abs(T[order[0]] - slide.numpy()).max() < 0.01
+    upright = refined(pair, pair, slide[None])
+    assert len(upright) == 1
