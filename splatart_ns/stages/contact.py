@@ -33,11 +33,12 @@ class Contact:
     def distance_to_axis(self, axis: Tensor, origin: Tensor) -> float:
         """How far the line through `origin` [3] along the unit vector `axis` [3] passes by the two parts, added up.
 
-        That of their contact would not do: what two knobs have nearest to each other lies on a wrong axis between them
-        as near as the rim of a knob, behind which the panel is hidden, to the right one.
+        By a part that lies all around it, it does not: no image shows what is behind a knob. The distance of their
+        contact would not do: what two knobs have nearest to each other lies on a wrong axis between them as near as the
+        rim of a knob, behind which the panel is hidden, to the right one.
         """
         across = (torch.linalg.cross(points - origin, axis.expand_as(points)) for points in self.parts)
-        return sum(_nearest(torch.linalg.vector_norm(x, dim=-1)) for x in across)
+        return sum(0.0 if _all_around(x, axis) else _nearest(torch.linalg.vector_norm(x, dim=-1)) for x in across)
 
     def distance_to_point(self, point: Tensor) -> float:
         """How far a point [3] lies from the two parts, added up."""
@@ -47,6 +48,17 @@ class Contact:
 def _nearest(distances: Tensor) -> float:
     """1st percentile of distances [N]: no stray point decides."""
     return float(distances.kthvalue(max(1, round(_TOUCHING * len(distances)))).values)
+
+
+def _all_around(across: Tensor, axis: Tensor) -> bool:
+    """Whether on no side of a line along `axis` [3] are fewer points than a contact has (Tukey's depth of the line).
+
+    `across` [N, 3]: the points' distances from it, in the plane across it.
+    """
+    u = torch.linalg.cross(axis, torch.eye(3).to(axis)[axis.abs().argmin()])
+    angles = torch.arange(0, 360, 10).to(axis).deg2rad()[:, None]
+    sides = angles.cos() * u + angles.sin() * torch.linalg.cross(axis, u)
+    return bool((across @ sides.T > 0).double().mean(0).min() >= _TOUCHING)
 
 
 def find_contacts(

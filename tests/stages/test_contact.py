@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from splatart_ns.geometry.se3 import from_rotation_translation
-from splatart_ns.stages.contact import find_contacts
+from splatart_ns.stages.contact import Contact, find_contacts
 from splatart_ns.stages.joint_parameters import joint_motion
 
 
@@ -50,3 +50,17 @@ def test_large_parts_are_thinned():
     still = slide((0, 0, 0), (0, 0, 0))
     contact = find_contacts(points, {1: still, 2: still})[1, 2]
     assert len(contact.points) == 36  # 1 % of 9000 / 5 on either side
+
+
+def test_an_axis_passes_through_what_lies_all_around_it_and_by_what_does_not():
+    """A panel with a hole behind a knob: the knob's axis goes through the hole, another passes beside the panel."""
+    panel = box((-1.0, -1.0, -0.02), (1.0, 1.0, 0.0))
+    panel = panel[panel[:, :2].norm(dim=1) > 0.3]
+    knob = box((-0.25, -0.25, 0.02), (0.25, 0.25, 0.2), seed=1)
+    contact = Contact(0.02, knob[:1], (panel, knob))
+    z = torch.tensor([0.0, 0.0, 1.0], dtype=panel.dtype)
+    assert contact.distance_to_axis(z, torch.zeros_like(z)) == 0
+    beside = contact.distance_to_axis(z, torch.tensor([1.5, 0.0, 0.0]).to(z))
+    assert beside == pytest.approx(0.5 + 1.25, abs=0.1)
+    between = contact.distance_to_axis(z, torch.tensor([0.28, 0.0, 0.0]).to(z))
+    assert between == pytest.approx(0.03, abs=0.03) and between > 0
