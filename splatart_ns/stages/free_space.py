@@ -33,7 +33,7 @@ class FreeSpace:
 
     views: Sequence[View]
     empty: Sequence[Tensor]
-    """The background of each [H, W] bool, without the pixels next to the object."""
+    """The background of each [H, W] bool, without the pixels next to what is not, or may not be."""
 
     @staticmethod
     def of(views: Sequence[View]) -> FreeSpace:
@@ -43,6 +43,8 @@ class FreeSpace:
             if view.alpha is None and view.labels is None:
                 continue
             background = view.labels == 0 if view.alpha is None else view.alpha < 128
+            if view.mask is not None:
+                background &= view.mask
             beside = F.max_pool2d((~background).float()[None], 3, stride=1, padding=1)[0] > 0
             chosen.append(view)
             empty.append(~beside)

@@ -196,3 +196,13 @@ def test_a_door_that_was_shut_is_found_better(cupboard, monkeypatch):
     angle_before, shift_before = errors()
     assert angle < 0.5 * angle_before
     assert shift < 0.3 * shift_before
+
+
+def test_a_part_that_lies_flush_in_one_state_keeps_what_reaches_into_the_background(cupboard, monkeypatch):
+    asked = []
+    monkeypatch.setattr(pose_evidence, "without_haze", lambda pair, T, free: asked.append(pair) or pair)
+    refine_poses(*cupboard, POSES, torch.tensor([[True, True], [True, False]]))
+    assert not asked
+    monkeypatch.setattr(pose_evidence, "is_flush", lambda views, part: False)
+    refine_poses(*cupboard, POSES, torch.tensor([[True, True], [True, False]]))
+    assert len(asked) == 1

@@ -56,6 +56,12 @@ def test_views_that_tell_no_background_show_nothing_to_be_empty(scene):
     assert not FreeSpace.of([replace(v, alpha=None, labels=None) for v in views[0]]).reached_by(splats[0]).any()
 
 
+def test_pixels_that_a_mask_leaves_out_are_not_known_to_be_empty(scene):
+    splats, views = scene
+    masked = [replace(v, mask=torch.zeros_like(v.alpha, dtype=torch.bool)) for v in views[0]]
+    assert not FreeSpace.of(masked).reached_by(splats[0]).any()
+
+
 def test_of_many_views_some_are_asked(scene):
     _, views = scene
     assert len(FreeSpace.of(views[0] * 10).views) == 40
