@@ -33,12 +33,15 @@ class Contact:
     def distance_to_axis(self, axis: Tensor, origin: Tensor) -> float:
         """How far the line through `origin` [3] along the unit vector `axis` [3] passes by the two parts, added up.
 
-        By a part that lies all around it, it does not: no image shows what is behind a knob. The distance of their
-        contact would not do: what two knobs have nearest to each other lies on a wrong axis between them as near as the
-        rim of a knob, behind which the panel is hidden, to the right one.
+        By a part that lies all around it, with a hole there for the other part, it does not: no image shows what is
+        behind a knob. The distance of their contact would not do: what two knobs have nearest to each other lies on a
+        wrong axis between them as near as the rim of a knob, behind which the panel is hidden, to the right one.
         """
-        across = (torch.linalg.cross(points - origin, axis.expand_as(points)) for points in self.parts)
-        return sum(0.0 if _all_around(x, axis) else _nearest(torch.linalg.vector_norm(x, dim=-1)) for x in across)
+        across = [torch.linalg.cross(points - origin, axis.expand_as(points)) for points in self.parts]
+        nearest, farthest = zip(*(_extent(torch.linalg.vector_norm(x, dim=-1)) for x in across), strict=True)
+        # A hole less than half as wide as the other part is not for it, and may be the distance of the samples.
+        holes = [2 * nearest[k] > farthest[1 - k] and _all_around(x, axis) for k, x in enumerate(across)]
+        return sum(0.0 if hole else distance for hole, distance in zip(holes, nearest, strict=True))
 
     def distance_to_point(self, point: Tensor) -> float:
         """How far a point [3] lies from the two parts, added up."""
@@ -47,7 +50,13 @@ class Contact:
 
 def _nearest(distances: Tensor) -> float:
     """1st percentile of distances [N]: no stray point decides."""
-    return float(distances.kthvalue(max(1, round(_TOUCHING * len(distances)))).values)
+    return _extent(distances)[0]
+
+
+def _extent(distances: Tensor) -> tuple[float, float]:
+    """1st and 99th percentile of distances [N]."""
+    rank = max(1, round(_TOUCHING * len(distances)))
+    return float(distances.kthvalue(rank).values), float(distances.kthvalue(len(distances) + 1 - rank).values)
 
 
 def _all_around(across: Tensor, axis: Tensor) -> bool:
