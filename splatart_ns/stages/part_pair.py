@@ -25,6 +25,8 @@ RGB_WEIGHT = 0.3
 CHROMA_WEIGHT = 2.0
 """That of what is left of a colour difference without its mean over the channels, where asked for: light that stays in
 the world while parts turn changes how bright they are, and hardly their hue."""
+IN_EVEN_LIGHT = {"chroma_weight": CHROMA_WEIGHT, "brightness_weight": 1.0, "even_light": True}
+"""How a `PartPair` looks at hues and, as if both states were lit alike, at brightness."""
 HUBER = 0.15
 """Residuals beyond this count linearly."""
 MARGIN = 8

@@ -17,7 +17,7 @@ from splatart_ns.stages.covisibility import compared_by_common, covisible
 from splatart_ns.stages.flush import compared_by_seen, in_sight, is_flush, surface_depths, without_neighbours
 from splatart_ns.stages.free_space import FreeSpace, without_haze
 from splatart_ns.stages.joint import PRISMATIC_BELOW
-from splatart_ns.stages.part_pair import CHROMA_WEIGHT, PartPair, part_pair
+from splatart_ns.stages.part_pair import IN_EVEN_LIGHT, PartPair, part_pair
 from splatart_ns.stages.refinement import motion_covariance, refine, rotation_held_ratio, shifted
 from splatart_ns.stages.render_choice import FINE_PIXELS, VIEWS
 from splatart_ns.stages.symmetry import settle_turn
@@ -27,8 +27,6 @@ ALL_VIEWS = 60
 """Views of each state that the last refinement looks at, where there are so many."""
 MAX_ITERATIONS = 16
 """Most parts take 1 to 5; a shut door that begins 3 % of the object off took 14."""
-IN_EVEN_LIGHT = {"chroma_weight": CHROMA_WEIGHT, "brightness_weight": 1.0, "even_light": True}
-"""How that looks at a `PartPair`."""
 MAYBE_SLIDING = math.radians(10)
 """A part that turned less than this against another may be sliding: thin parts' turns are known no better."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import from_rotation_translation, so3_log
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.part_pair import PartPair, part_pair
+from splatart_ns.stages.part_pair import IN_EVEN_LIGHT, PartPair, part_pair
 from splatart_ns.stages.refinement import Refinement, increment, refine, shifted
 from splatart_ns.stages.registration import MIN_POINTS, distinct, part_points, point_to_plane, register
 from splatart_ns.stages.shading import without_shading
@@ -59,6 +59,9 @@ ALIKE = 1.25
 more measured 1.08 to 1.18, hexagonal ones 1.03 to 1.12, other parts that are seen well above 2."""
 STILL_RATIO = 1.2
 """A part whose images fit no motion worse than this many times the best motion did not move."""
+SHADED_RATIO = 2.0
+"""Nor one that fits no motion worse than this and would have turned far, if in even light it fits as well unmoved: what
+moved beside it shades it otherwise."""
 
 
 @dataclass(frozen=True)
@@ -133,6 +136,10 @@ def initial_motion(
     best = ends[order[0]]
     identity_ratio = identity_cost / max(best.cost, 1e-12)
     still = identity_ratio < STILL_RATIO
+    if not still and identity_ratio < SHADED_RATIO and so3_log(best.T[:3, :3]).norm() > OTHERWISE / 2:
+        even = part_pair(splats, views, part, DOUBTFUL_VIEWS, FINE_PIXELS)
+        stayed, turned = replace(even, **IN_EVEN_LIGHT).cost(torch.stack([identity, best.T])).tolist()
+        still = stayed < STILL_RATIO * turned
     return InitialMotion(
         identity if still else best.T,
         found=True,

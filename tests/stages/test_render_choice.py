@@ -7,7 +7,16 @@ from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import render_choice
 from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.registration import part_points, register
-from splatart_ns.stages.render_choice import choose, initial_motion, prefer_slide, prefer_turn, ranked, refined
+from splatart_ns.stages.render_choice import (
+    SHADED_RATIO,
+    STILL_RATIO,
+    choose,
+    initial_motion,
+    prefer_slide,
+    prefer_turn,
+    ranked,
+    refined,
+)
 from splatart_ns.stages.visibility import visibility
 
 TRUTH = motion((0, 0, 70), (0.3, 0.2, 0.1))
@@ -108,6 +117,34 @@ def test_a_still_part_does_not_move_at_all(scene):
     found = initial_motion(*scene, part=1)
     assert found.still
     assert torch.equal(found.T, torch.eye(4, dtype=torch.float64))
+
+
+def blotched_plate(T, colours):
+    """Splats, views and visibilities of a square plate at two states; `colours` (means [N, 3], state) of it [N, 3]."""
+    plate = box(1, (0.6, 0.6, 0.16), (0.0, 0.0, 0.0), spacing=0.05)
+    splats, generator = (plate, plate.transformed(T)), torch.Generator().manual_seed(0)
+    for state, splat in enumerate(splats):  # else no motion but the right one would fit at all
+        blotches = 0.4 * torch.randn(len(plate.means), 1, generator=generator)
+        splat.sh = (colours(plate.means, state) + blotches)[:, None]
+    views = tuple(photograph(s, count=20) for s in splats)
+    return splats, views, tuple(visibility(s, v) for s, v in zip(splats, views, strict=True))
+
+
+def test_a_square_part_that_others_shade_elsewhere_has_not_turned():
+    """The shadow on it, of a lid that opened, lies a quarter turn on."""
+    eye = torch.eye(4, dtype=torch.float64)
+    scene = blotched_plate(eye, lambda x, state: -0.2 * (x[:, state, None] > 0) * torch.ones(3))
+    found = initial_motion(*scene, part=1)
+    assert found.still and torch.equal(found.T, eye)
+    assert found.identity_ratio > STILL_RATIO
+
+
+def test_a_square_part_with_a_print_that_turned_a_quarter_did_not_stay():
+    T = motion((0, 0, 90), (0, 0, 0))
+    scene = blotched_plate(T, lambda x, _: 0.3 * (x[:, :2].amin(1) > 0.1)[:, None] * torch.tensor([1.0, -1.0, -1.0]))
+    found = initial_motion(*scene, part=1)
+    assert not found.still and angle_deg(found.T, T) < 2
+    assert found.identity_ratio < SHADED_RATIO
 
 
 def test_a_tin_that_looks_alike_upside_down_but_for_its_colour_is_not_flipped():
