@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, inverse
-from splatart_ns.stages.joint_fit import JointFit
+from splatart_ns.stages.joint_fit import UNSEEN_ROTATION, JointFit
 from splatart_ns.stages.joint_parameters import JOINT_DOFS
 from splatart_ns.stages.joint_solver import best_joints
 
@@ -35,8 +35,6 @@ EPSILON = 0.02
 """Default limit of the residual, as a share of the object's bounding radius."""
 PRISMATIC_BELOW = 1.2
 """A joint slides if holding the rotation raises the rendering cost by less than this factor."""
-UNSEEN_ROTATION = math.radians(30)
-"""A turn known no better than this is not seen: the part may have turned by any angle."""
 
 # Parameters of a type besides its values.
 _SHAPE = {"fixed": 0, "prismatic": 2, "revolute": 4, "screw": 5, "cylindrical": 4, "spherical": 3, "free": 0}

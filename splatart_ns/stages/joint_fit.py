@@ -11,6 +11,9 @@ from torch import Tensor
 from splatart_ns.geometry.se3 import se3_log, transform_points
 from splatart_ns.stages.joint_parameters import JOINT_DOFS, joint_motion
 
+UNSEEN_ROTATION = math.radians(30)
+"""A turn known no better than this is not seen: the part may have turned by any angle."""
+
 
 @dataclass(frozen=True)
 class JointFit:
@@ -54,8 +57,13 @@ class JointFit:
 
     @property
     def limits(self) -> tuple[float, float] | None:
-        """The observed range of the value; None for more than one degree of freedom."""
-        return (float(self.values.min()), float(self.values.max())) if self.dofs <= 1 else None
+        """The observed range of the value, a whole turn where nothing tells it; None for more than one freedom."""
+        if self.dofs > 1:
+            return None
+        sigma = max((row[k] for k, row in enumerate(self.covariance.get("values", []))), default=0.0) ** 0.5
+        if self.type == "revolute" and sigma > UNSEEN_ROTATION:
+            return -math.pi, math.pi
+        return float(self.values.min()), float(self.values.max())
 
     def motion(self, values: Tensor) -> Tensor:
         """Motions [..., 4, 4] of the child relative to its parent at values [...], or [..., D] for D > 1 freedoms."""

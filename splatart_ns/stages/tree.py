@@ -31,6 +31,7 @@ from splatart_ns.stages.joint_fit import JointFit, free_joint
 from splatart_ns.stages.joint_pairs import descend_pairs, fit_pairs, stood_still, surface_error, told_pair
 from splatart_ns.stages.tree_refinement import refine_tree
 from splatart_ns.stages.unseen import known_states, leads_blindly, may_have_turned, place_unseen
+from splatart_ns.stages.unseen_turn import turned_unseen
 
 JointMethod = Literal["screw", "descent"]
 _SEEN_NOISE = 0.3
@@ -137,7 +138,8 @@ def infer_tree(
         if covariances is not None:
             unknown = (10 * radius) ** 2 * torch.eye(6).to(errors[p])
             errors[p] = errors[p] + torch.where(known[p][:, None, None], covariances[p].to(errors[p]), unknown)
-    return refine_tree(tree, points, motions, errors)
+    tree = refine_tree(tree, points, motions, errors)
+    return tree if covariances is None else turned_unseen(tree, points, motions, covariances, errors, constraints)
 
 
 def choose_root(

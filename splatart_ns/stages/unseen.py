@@ -14,7 +14,7 @@ from torch import Tensor
 
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.stages.articulate import KinematicTree
-from splatart_ns.stages.joint import UNSEEN_ROTATION
+from splatart_ns.stages.joint_fit import UNSEEN_ROTATION
 
 
 def known_states(motions: Mapping[int, Tensor], covariances: Mapping[int, Tensor] | None) -> dict[int, Tensor]:

@@ -327,9 +327,23 @@ def test_a_disc_that_may_have_turned_unseen_leaves_root_and_other_joints_alone_a
     assert joints[3].fit.type == others[3].fit.type == "revolute"
     assert torch.allclose(joints[3].fit.values, others[3].fit.values)
     assert not joints[3].fit.ambiguous
-    assert joints[2].fit.type == "fixed" and joints[2].fit.ambiguous
-    assert not others[2].fit.ambiguous
-    assert "revolute" in [other["type"] for other in joints[2].fit.alternatives]
+    disc = joints[2].fit
+    assert others[2].fit.type == "fixed" and not others[2].fit.ambiguous
+    assert disc.type == "revolute" and disc.ambiguous and disc.residual == 0 and not disc.values.any()
+    assert torch.allclose(disc.axis.abs(), X, atol=1e-6)
+    centre = points[2].double().mean(0)
+    assert torch.allclose(torch.linalg.cross(disc.origin - centre, disc.axis), 0 * X, atol=1e-5)
+    assert disc.limits == (-math.pi, math.pi) and math.degrees(disc.covariance["values"][1][1] ** 0.5) > 60
+    spread = torch.tensor(disc.covariance["axis"]).diagonal()
+    assert spread[0] == 0 and all(1e-6 <= variance < 1e-4 for variance in spread[1:])
+    assert [other["type"] for other in disc.alternatives] == ["fixed", "prismatic"]
+
+
+def test_a_ball_that_may_have_turned_about_any_axis_is_fixed():
+    points, motions, covariances = round_part_and_door()
+    covariances[2] = covariances[2] + torch.block_diag(torch.zeros(3, 3), torch.eye(3)).double()
+    joint = {j.child: j.fit for j in infer_tree(points, motions, covariances=covariances).joints}[2]
+    assert joint.type == "fixed" and joint.ambiguous
 
 
 def test_a_disc_that_the_user_says_turns_has_values_as_uncertain_as_its_turn():
@@ -339,7 +353,14 @@ def test_a_disc_that_the_user_says_turns_has_values_as_uncertain_as_its_turn():
     fit = next(j.fit for j in tree.joints if j.child == 2)
     assert fit.type == "revolute"
     assert math.degrees(fit.covariance["values"][1][1] ** 0.5) > 60
-    assert torch.isfinite(torch.cat([fit.axis, fit.origin, fit.values])).all()
+    assert torch.allclose(fit.axis.abs(), X, atol=1e-6) and not fit.values.any()
+
+
+@pytest.mark.parametrize("told", [JointConstraint(1, 2, "fixed"), JointConstraint(2, 1, "revolute", forbidden=True)])
+def test_a_disc_that_the_user_says_does_not_turn_is_fixed(told):
+    points, motions, covariances = round_part_and_door()
+    tree = infer_tree(points, motions, covariances=covariances, constraints=[told])
+    assert next(j.fit.type for j in tree.joints if j.child == 2) == "fixed"
 
 
 @pytest.mark.parametrize("root", [None, 1])

@@ -1,0 +1,87 @@
+"""Round parts that rest: knobs and wheels, which look alike however they turn about their axis of symmetry.
+
+Nothing tells whether they turned. A fixed joint would explain all that is seen, but nobody labels a knob as a part of
+its own for it to be fixed: it hangs on a joint about its axis, of which nothing tells the values.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from splatart_ns.geometry.se3 import adjoint, inverse, skew
+from splatart_ns.stages.articulate import KinematicTree
+from splatart_ns.stages.joint_constraint import JointConstraint
+from splatart_ns.stages.joint_fit import UNSEEN_ROTATION, JointFit
+
+
+def turned_unseen(
+    tree: KinematicTree,
+    points: Mapping[int, Tensor],
+    motions: Mapping[int, Tensor],
+    covariances: Mapping[int, Tensor],
+    errors: Mapping[int, Tensor],
+    constraints: Sequence[JointConstraint] = (),
+) -> KinematicTree:
+    """The tree, where parts that rest on their parents, but may have turned about one axis, hang on joints about that.
+
+    Args:
+        tree: Joints that were fitted to what is seen.
+        points: Of each part [N, 3], at state 0.
+        motions: Observed motions [S, 4, 4] by part, canonical frame.
+        covariances: Theirs [S, 6, 6], T_true = exp(d) T, d = (translation, rotation) about the world's origin.
+        errors: The same with the noise of the points, which sees every turn.
+        constraints: What the user knows of joints; one that is said to be fixed, or not to turn, stays as it is.
+    """
+    joints = []
+    for joint in tree.joints:
+        pair = {joint.parent, joint.child}
+        told = {(c.type, c.forbidden) for c in constraints if {c.parent, c.child} == pair}
+        rests = joint.fit.type in ("fixed", "revolute") and not joint.fit.values.any()
+        if rests and not told & {("fixed", False), ("revolute", True)}:
+            to_parent = adjoint(inverse(motions[joint.parent].double()))
+            C, E = (to_parent @ of[joint.child].to(to_parent) @ to_parent.mT for of in (covariances, errors))
+            joint = replace(joint, fit=_about_unseen_axis(joint.fit, points[joint.child].to(C), C.nan_to_num(), E))
+        joints.append(joint)
+    return replace(tree, joints=joints)
+
+
+def _about_unseen_axis(fit: JointFit, points: Tensor, C: Tensor, errors: Tensor) -> JointFit:
+    """The joint of a child with points [N, 3] that rests, about the one axis about which its pose may have turned by
+    any angle, from the covariances C and errors [S, 6, 6] of its motion; `fit` if there is none, or more than one."""
+    variances, directions = torch.linalg.eigh(C[:, 3:, 3:])
+    state = int(variances[:, -1].argmax())
+    if (variances[state] > UNSEEN_ROTATION**2).sum() != 1:
+        return fit
+    axis, variance = directions[state, :, -1], variances[state, -1]
+    twist = C[state, :, 3:] @ axis / variance
+    origin = torch.linalg.cross(axis, twist[:3])
+    origin = origin + (points.mean(0) - origin) @ axis * axis
+    # What else is uncertain moves the axis along with the part.
+    rest = errors[state] - variance * twist.outer(twist)
+    moves_axis = torch.cat([torch.zeros(3, 3).to(C), -skew(axis)], 1)
+    moves_origin = (torch.eye(3).to(C) - axis.outer(axis)) @ torch.cat([torch.eye(3).to(C), -skew(origin)], 1)
+    covariance = {
+        "axis": moves_axis @ rest @ moves_axis.mT,
+        "origin": moves_origin @ rest @ moves_origin.mT,
+        "axis_origin": moves_axis @ rest @ moves_origin.mT,
+        "values": (variances[:, -1] * (variances[:, -1] > UNSEEN_ROTATION**2)).diag(),
+    }
+    others = {other["type"]: other for other in fit.alternatives}
+    others[fit.type] = {"type": fit.type, "residual": fit.residual, "score": fit.score}
+    score = others.pop("revolute", {}).get("score", math.inf)
+    return replace(
+        fit,
+        type="revolute",
+        axis=axis,
+        origin=origin,
+        score=score,
+        covariance={name: block.tolist() for name, block in covariance.items()},
+        ambiguous=True,
+        alternatives=sorted(others.values(), key=lambda other: other["score"]),
+        undetermined=["The part looks alike however it turns about its axis, so whether it did is undetermined."],
+    )
