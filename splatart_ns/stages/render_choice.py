@@ -48,7 +48,7 @@ SEARCH_STEPS = (0.6, 0.3, 0.15, 0.08)
 SLIDE_TURN = 6.0
 """Degrees by which a slide may seem to turn."""
 TURNED_OVER = math.radians(90)
-"""To a motion that turns a part by more a slide is preferred that fits nearly as well."""
+"""To a motion that turns a part by more a slide is preferred that looks alike."""
 PITCHED, UNPITCHED = 0.1, 0.03
 """A motion that shifts a part by more than the first along its axis, in part radii, is no mere turn; one that shifts it
 by less than the second is."""
@@ -218,7 +218,7 @@ def prefer_slide(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]
     Where one state hides most of a part, no motion fits well: a drawer was seen to render a tenth better turned over.
     """
     turn = np.arccos(((np.einsum("cii->c", T[:, :3, :3]) - 1) / 2).clip(-1, 1))
-    slides = [i for i in order if turn[i] < math.radians(SLIDE_TURN) and cost[i] < STILL_RATIO * cost[order[0]]]
+    slides = [i for i in order if turn[i] < math.radians(SLIDE_TURN) and cost[i] < ALIKE * cost[order[0]]]
     if turn[order[0]] < TURNED_OVER or not slides:
         return order
     return [slides[0], *(i for i in order if i != slides[0])]

@@ -8,6 +8,7 @@ from splatart_ns.stages import render_choice
 from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.registration import part_points, register
 from splatart_ns.stages.render_choice import (
+    ALIKE,
     SHADED_RATIO,
     STILL_RATIO,
     choose,
@@ -188,7 +189,7 @@ def test_a_few_gaussians_of_a_sliver_are_enough():
 
 def test_a_slide_that_fits_nearly_as_well_is_preferred_to_turning_over():
     T = np.stack([motion(turn, (0, 0, 0)).numpy() for turn in ((0, 178, 0), (0, 0, 60), (0, 0, 2))])
-    assert prefer_slide(T, np.array([1.0, 1.05, 1.15]), [0, 1, 2]) == [2, 0, 1]
+    assert prefer_slide(T, np.array([1.0, 1.05, 0.98 * ALIKE]), [0, 1, 2]) == [2, 0, 1]
     assert prefer_slide(T, np.array([1.0, 1.05, 1.3]), [0, 1, 2]) == [0, 1, 2]
     assert prefer_slide(T, np.array([1.1, 1.0, 1.15]), [1, 0, 2]) == [1, 0, 2]
 
