@@ -17,6 +17,7 @@ from splatart_ns.geometry.se3 import adjoint, inverse, skew
 from splatart_ns.stages.articulate import KinematicTree
 from splatart_ns.stages.joint_constraint import JointConstraint
 from splatart_ns.stages.joint_fit import UNSEEN_ROTATION, JointFit
+from splatart_ns.stages.joint_pairs import stood_still
 
 
 def turned_unseen(
@@ -44,7 +45,8 @@ def turned_unseen(
         rests = joint.fit.type in ("fixed", "revolute") and not joint.fit.values.any()
         if rests and not told & {("fixed", False), ("revolute", True)}:
             to_parent = adjoint(inverse(motions[joint.parent].double()))
-            C, E = (to_parent @ of[joint.child].to(to_parent) @ to_parent.mT for of in (covariances, errors))
+            relative = errors[joint.child] + (0 if stood_still(joint.parent, motions) else errors[joint.parent])
+            C, E = (to_parent @ x.to(to_parent) @ to_parent.mT for x in (covariances[joint.child], relative))
             joint = replace(joint, fit=_about_unseen_axis(joint.fit, points[joint.child].to(C), C.nan_to_num(), E))
         joints.append(joint)
     return replace(tree, joints=joints)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from splatart_ns.errors import InputError
-from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp, so3_exp, transform_points
+from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, inverse, se3_exp, so3_exp, transform_points
 from splatart_ns.stages.arborescence import cheapest_parents
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.contact import Contact, find_contacts
@@ -337,6 +337,21 @@ def test_a_disc_that_may_have_turned_unseen_leaves_root_and_other_joints_alone_a
     spread = torch.tensor(disc.covariance["axis"]).diagonal()
     assert spread[0] == 0 and all(1e-6 <= variance < 1e-4 for variance in spread[1:])
     assert [other["type"] for other in disc.alternatives] == ["fixed", "prismatic"]
+
+
+def test_the_axis_of_a_knob_on_a_door_is_no_surer_than_where_the_door_is():
+    points, motions, covariances = round_part_and_door()
+    points[2] = box((0.8, 0.45, 0.4), (0.2, 0.1, 0.2), 1)  # on the door, about y
+    motions[2] = motions[3]
+    twist = adjoint(motions[3][1]) @ torch.cat([torch.linalg.cross(points[2].mean(0), Y), Y])
+    covariances[2] = covariances[1].clone()
+    covariances[2][1] += math.pi**2 / 3 * twist.outer(twist)
+    covariances[3] = 1e-3 * torch.eye(6).double().repeat(2, 1, 1)
+    tree = infer_tree(points, motions, covariances=covariances)
+    knob = {j.child: j for j in tree.joints}[2]
+    assert knob.parent == 3 and knob.fit.type == "revolute"
+    assert float(knob.fit.axis[1].abs()) == pytest.approx(1, abs=1e-6)
+    assert all(variance > 1e-3 for variance in torch.tensor(knob.fit.covariance["axis"]).diagonal()[[0, 2]])
 
 
 def test_a_ball_that_may_have_turned_about_any_axis_is_fixed():
