@@ -77,8 +77,7 @@ class Dataset:
         states = self.options.states
         for number, (name, joint) in enumerate(self.splat.joints.items()):
             rng = np.random.default_rng([self.options.seed, 0, number])
-            observed = joint.values.reshape(len(joint.values), -1).numpy()
-            low, high = observed.min(0), observed.max(0)
+            low, high = np.array(joint.ranges).T
             places = np.stack([rng.permutation(states) for _ in low], -1) + rng.uniform(size=len(low))
             values = (low + (high - low) * places[state] / states).tolist()
             q[name] = values if len(values) > 1 else values[0]

@@ -60,7 +60,14 @@ class Slider:
     high: float
     step: float
     observed: tuple[float, float]
-    """The least and the greatest value over the states, and 0, where state 0 is."""
+    """Of the joint's `ranges`."""
+
+    @property
+    def note(self) -> str:
+        """What is known of the range."""
+        if self.unit == "degree" and np.allclose(self.observed, (-180, 180)):
+            return "nothing tells how far it turned"
+        return f"observed {' to '.join(f'{x:.4g}' for x in sorted(set(self.observed)))} {self.unit}"
 
     @property
     def units(self) -> float:
@@ -72,12 +79,10 @@ def bundle_sliders(bundle: Bundle) -> list[Slider]:
     """The sliders of all movable joints of the tree, parents before children."""
     sliders = []
     for name, joint in movable_joints(bundle).items():
-        values = joint.values.reshape(len(joint.values), -1).numpy()
-        for index, (suffix, turns) in enumerate(freedoms(joint.type)):
+        for index, ((suffix, turns), ends) in enumerate(zip(freedoms(joint.type), joint.ranges, strict=True)):
             unit = unit_name(turns, bundle.length_unit)
-            shown = values[:, index] * (math.degrees(1) if turns else 1.0)
-            observed = float(min(shown.min(), 0.0)), float(max(shown.max(), 0.0))
-            sliders.append(Slider(name, index, f"{name}{suffix} ({unit})", unit, *slider_range(*observed), observed))
+            low, high = (end * (math.degrees(1) if turns else 1.0) for end in ends)
+            sliders.append(Slider(name, index, f"{name}{suffix} ({unit})", unit, *slider_range(low, high), (low, high)))
     return sliders
 
 

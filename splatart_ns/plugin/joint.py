@@ -124,7 +124,10 @@ class JointModel(SplatartModel):
         tree = self.tree
         for index, ((joint, what, turns), observed) in enumerate(zip(_freedoms(tree), tree.observed().mT, strict=True)):
             unit = math.degrees(1) if turns else 1 / scale
-            low, high, step = slider_range(*(float(x) * unit for x in (observed.min(), observed.max())))
+            ends = float(observed.min()), float(observed.max())
+            if joint.fit.type == "revolute" and ends == (0.0, 0.0):  # a round part whose turns nothing tells
+                ends = -math.pi, math.pi
+            low, high, step = slider_range(*(x * unit for x in ends))
             slider = ViewerSlider(
                 name=f"{self.part_names[joint.parent]}_to_{self.part_names[joint.child]}{what} "
                 f"({unit_name(turns, length_unit)})",

@@ -31,7 +31,7 @@ class Panel:
         with gui.add_folder("Joints"):
             for slider in self._limits:
                 limits = sorted(set(slider.observed))
-                hint = f"{hints[slider.joint]}; observed {' to '.join(f'{x:.4g}' for x in limits)} {slider.unit}"
+                hint = f"{hints[slider.joint]}; {slider.note}"
                 marks = tuple((x, f"{x:.3g}") for x in limits)
                 ends = (slider.low, slider.high, slider.step)
                 label = _breakable(slider.label)

@@ -57,6 +57,14 @@ def test_each_state_has_values_from_another_piece_of_the_observed_range(splat):
     assert abs(np.corrcoef(hinge, slide)[0, 1]) < 0.7
 
 
+def test_a_round_part_whose_turns_nothing_tells_is_shown_turned(bundle):
+    joint = bundle.joints[0]
+    joint.type, joint.limits, joint.values = "revolute", (-np.pi, np.pi), 0 * joint.values
+    turned = Dataset(ArticulatedSplat(bundle), DatasetOptions(states=8))
+    values = np.array([turned.configuration(k)[joint.name] for k in range(8)])
+    assert values.min() < -0.7 * np.pi and values.max() > 0.7 * np.pi
+
+
 def test_a_joint_of_several_freedoms_stays_within_what_was_observed_of_each(bundle):
     joint = bundle.joints[0]
     joint.type, joint.limits, joint.values = "spherical", None, torch.tensor([[0.0, 0, 0], [0.3, 0, -0.2]]).double()

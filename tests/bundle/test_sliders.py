@@ -22,6 +22,14 @@ def test_one_slider_a_freedom_with_unit_and_limits(bundle):
     assert hinge.low <= -45 and hinge.high >= 135
 
 
+def test_a_round_part_whose_turns_nothing_tells_can_be_turned_all_round(bundle):
+    told = bundle_sliders(bundle)[0]
+    bundle.joints[1] = replace(bundle.joints[1], values=0 * bundle.joints[1].values, limits=(-math.pi, math.pi))
+    hinge = bundle_sliders(bundle)[0]
+    assert hinge.observed == pytest.approx((-180, 180)) and hinge.low <= -180 and hinge.high >= 180
+    assert (told.note, hinge.note) == ("observed 0 to 90 degree", "nothing tells how far it turned")
+
+
 def test_a_length_of_unknown_unit_is_called_a_length(bundle):
     bundle.length_unit = "unknown"
     assert bundle_sliders(bundle)[1].label == "slide (length)"

@@ -92,6 +92,14 @@ def test_one_slider_a_joint_with_its_unit() -> None:
     assert door.min < -0.4 * math.degrees(DOOR) and door.max > 1.4 * math.degrees(DOOR)
 
 
+def test_a_round_part_whose_turns_nothing_tells_can_be_turned_all_round() -> None:
+    knob = JointFit("revolute", torch.eye(3).double()[2], HINGE, 0.0, torch.zeros(2).double(), residual=0.0)
+    model = new_model()
+    tree = KinematicTree([1, 2], 1, [Joint(1, 2, knob)])
+    model.start(splat_of_parts(1, 2, 3), tree, torch.eye(4).double().repeat(2, 3, 1, 1), NORMALIZATION)
+    assert model.joint_00.value == 0 and model.joint_00.min <= -180 and model.joint_00.max >= 180
+
+
 @pytest.mark.parametrize("state", [0, 1])
 def test_at_first_the_state_is_shown(state: int) -> None:
     model, splat, motions = started_model(state)

@@ -81,6 +81,7 @@ def page_object(bundle: Bundle) -> dict[str, Any]:
                 "high": slider.high,
                 "step": slider.step,
                 "observed": list(slider.observed),
+                "note": slider.note,
             }
             for slider in bundle_sliders(bundle)
         ],

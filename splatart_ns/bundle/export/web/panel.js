@@ -34,8 +34,7 @@ class Panel {
         const head = element("div", {className: "head"},
             swatch(this.object.parts[joint.child]), element("span", {className: "name"}, breakable(slider.name)),
             number, element("span", {className: "unit"}, slider.unit));
-        const observed = slider.observed.map(x => digits(x)).join(" to ");
-        const note = element("div", {className: "note"}, `${joint.type}, observed ${observed} ${slider.unit}`);
+        const note = element("div", {className: "note"}, `${joint.type}, ${slider.note}`);
         get("sliders").append(element("div", {className: "slider"}, head, range, marks, note));
         return {range, number};
     }

@@ -27,7 +27,7 @@ function hasAxis(joint) {
 /** What was observed, for each freedom. */
 function observed(joint) {
     return joint.freedoms.map(({name, unit}, i) => {
-        const values = joint.values.map(value => value[i] * perUnit(unit));
+        const range = joint.limits ?? joint.values.map(value => value[i]), values = range.map(x => x * perUnit(unit));
         return `${name} ${digits(Math.min(...values))} to ${digits(Math.max(...values))} ${unit}`.trim();
     }).join("; ") || "–";
 }
