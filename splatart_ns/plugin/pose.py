@@ -200,7 +200,8 @@ class PosePipeline(VanillaPipeline):
             M[..., :3, 3] = centroids - centroids[0]
             return M
         # Where cameras were refined, each state has kept the mean error of its own: what rests seems to move by that.
-        snap = self.config.snap and not self._cameras_refined
+        # A part that brought worlds together rests by definition, but is found no more exactly than one that moved.
+        snap = self.config.snap and not self._cameras_refined and "worlds" not in self.findings
         self._reference = reference_states(splats, self._seen, P)
         found: dict[tuple[int, int], dict[int, InitialMotion]] = {}
         for p, first in enumerate(self._reference):

@@ -14,7 +14,9 @@ from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import so3_log
 from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_of, similarity, view_of_moved
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.part_pair import part_pair
+from splatart_ns.stages.flush import is_flush
+from splatart_ns.stages.free_space import FreeSpace, without_haze
+from splatart_ns.stages.part_pair import IN_EVEN_LIGHT, part_pair
 from splatart_ns.stages.pose_evidence import ALL_VIEWS, MAX_ITERATIONS
 from splatart_ns.stages.refinement import motion_covariance, refine
 from splatart_ns.stages.registration import MIN_POINTS, part_points
@@ -45,7 +47,9 @@ def fit_world(
     """The similarity, or the rigid motion, of another state's world to that of state 0 under which `part` rests.
 
     Many-start registration chosen by rendering, after the part is given the radius that it has in state 0, and then
-    Gauss-Newton on images for all seven unknowns. None where the images show too little of the part.
+    Gauss-Newton on images for all seven unknowns: on few pixels, on many and, unless the part lies flush with others,
+    once more without haze (see `free_space`), which made a pair of scissors .1 % too small. None where the images show
+    too little of the part.
 
     Args:
         splats: The labelled splats of state 0 and of the other state, each in its own world.
@@ -56,21 +60,29 @@ def fit_world(
     if min(len(p.xyz) for p in points) < MIN_POINTS:
         return None
     factor = points[0].radius / points[1].radius if with_scale else 1.0
-    zoomed = similarity(factor, torch.eye(3), torch.zeros(3))
-    pair_splats = splats[0], splats[1].scaled(factor)
-    pair_views = views[0], moved_views(views[1], zoomed)
-    start = initial_motion(pair_splats, pair_views, seen, part, seed)
-    coarse = part_pair(pair_splats, pair_views, part, VIEWS, COARSE_PIXELS)
-    fine = part_pair(pair_splats, pair_views, part, ALL_VIEWS, FINE_PIXELS)
-    if not start.found or coarse is None or fine is None:
+    world = similarity(factor, torch.eye(3), torch.zeros(3))
+    zoomed = splats[0], splats[1].scaled(factor)
+    zoomed_views = views[0], moved_views(views[1], world)
+    start = initial_motion(zoomed, zoomed_views, seen, part, seed)
+    coarse = part_pair(zoomed, zoomed_views, part, VIEWS, COARSE_PIXELS)
+    if not start.found or coarse is None:
         return None
     T = refine(coarse, start.T, MAX_ITERATIONS, with_scale=with_scale).T
-    found = refine(fine, T, 2 * MAX_ITERATIONS, with_scale=with_scale)
+    world = inverse_similarity(T) @ world.to(T)
+    flush = any(is_flush(some, part) for some in views)
+    for without in (False,) if flush else (False, True):
+        there = moved_views(views[1], world)
+        brought = splats[0], moved_splat(splats[1], world)
+        pair = part_pair(brought, (views[0], there), part, ALL_VIEWS, FINE_PIXELS, near=True)
+        pair = replace(pair, **IN_EVEN_LIGHT)
+        if without:
+            pair = without_haze(pair, torch.eye(4).to(T), (FreeSpace.of(views[0]), FreeSpace.of(there)))
+        found = refine(pair, torch.eye(4).to(T), 2 * MAX_ITERATIONS, with_scale=with_scale)
+        world = inverse_similarity(found.T) @ world
     covariance = torch.zeros(7, 7, dtype=torch.float64, device=T.device)
     n = found.equations.H.shape[-1]
-    covariance[:n, :n] = motion_covariance(fine, found.T, found.equations)
-    ratio = found.cost / max(fine.own_cost(), 1e-12)
-    return WorldFit(inverse_similarity(found.T) @ zoomed.to(found.T), covariance, ratio)
+    covariance[:n, :n] = motion_covariance(pair, found.T, found.equations)
+    return WorldFit(world, covariance, found.cost / max(pair.own_cost(), 1e-12))
 
 
 def anchors(splats: Sequence[Splat], seen: Sequence[Tensor], num_parts: int) -> list[int]:

@@ -12,6 +12,7 @@ from splatart_ns.errors import InputError
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.stages.render_choice import InitialMotion
 from splatart_ns.stages.thinning import BUDGET, LARGEST_SHARE, ROUNDS
+from splatart_ns.stages.world import WorldFit
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +49,7 @@ def pose_trainer(capture_dir, semantic_runs, tmp_path):
         config.data = config.pipeline.datamanager.data = capture_dir
         config.pipeline.semantic_runs = semantic_runs
         config.pipeline.model.learn_gaussians = pipeline.pop("learn_gaussians", "after")
+        config.pipeline.datamanager.dataparser.worlds = pipeline.pop("worlds", None)
         for name, value in pipeline.items():
             setattr(config.pipeline, name, value)
         config.max_num_iterations, config.pipeline.model.pose_steps = steps, pose_steps
@@ -103,6 +105,16 @@ def test_a_part_in_doubt_is_sought_along_the_ways_of_sure_slides(pose_trainer, m
     assert sought == [(2, [[0.0, 1.0, 0.0]])]
     assert torch.equal(model.poses.T()[1], torch.stack([slide, better]))
     assert not any(model.alike)
+
+
+@pytest.mark.parametrize("worlds", ["shared", "rigid"])
+def test_only_in_one_world_is_what_looks_still_held_still(pose_trainer, monkeypatch, worlds):
+    still = InitialMotion(torch.eye(4).double(), found=True, still=True)
+    world = WorldFit(torch.eye(4).double(), torch.zeros(7, 7).double(), 1.0)
+    monkeypatch.setattr("splatart_ns.plugin.pose.initial_motion", lambda *_: still)
+    monkeypatch.setattr("splatart_ns.plugin.pose.fit_worlds", lambda *_: (1, [world]))
+    pipeline = pose_trainer(worlds=worlds).pipeline
+    assert pipeline._frozen[1].tolist() == [worlds == "shared"] * 2
 
 
 def test_a_missing_file_is_named(pose_trainer):

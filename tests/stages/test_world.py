@@ -1,11 +1,14 @@
+import math
 from dataclasses import replace
 
 import pytest
 import torch
-from part_scene import NUM_PARTS, angle_deg, motion, two_states
+from part_scene import NUM_PARTS, angle_deg, motion, photograph, two_states
 
 from splatart_ns.geometry.se3 import transform_points
 from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_of, similarity
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages import world
 from splatart_ns.stages.visibility import visibility
 from splatart_ns.stages.world import anchors, fit_world, fit_worlds, moved_splat, moved_views
 
@@ -40,6 +43,27 @@ def test_a_resting_part_brings_worlds_together(scale, with_scale):
     assert float(found.covariance[6, 6].sqrt()) < 5e-3 and (float(found.covariance[6, 6]) > 0) == with_scale
     corners = transform_points(T, torch.tensor([[0.45, 0.3, -0.3], [-0.45, -0.3, -0.15]]).double())
     assert torch.allclose(transform_points(found.T, corners), transform_points(there, corners), atol=3e-3)
+
+
+def test_haze_at_one_edge_makes_no_world_larger(monkeypatch):
+    clean, _ = two_states(TURN)
+    views = tuple(photograph(s, 24, 96) for s in clean)
+    row = torch.linspace(-0.3, 0.3, 15)
+    haze = replace(
+        clean[1].select(torch.arange(len(row))),
+        means=torch.stack([torch.full_like(row, 0.58), row, torch.full_like(row, -0.3)], -1),
+        log_scales=torch.full((len(row), 3), math.log(0.05)),
+        opacity_logits=torch.full((len(row),), 0.0),
+    )
+    splats = clean[0], Splat.cat([clean[1], haze])
+    seen = tuple(visibility(s, v) for s, v in zip(splats, views, strict=True))
+
+    def error():
+        return abs(float(scale_of(fit_world(splats, views, seen, 1, with_scale=True).T)) - 1)
+
+    clear = error()
+    monkeypatch.setattr(world, "without_haze", lambda pair, T, free: pair)
+    assert clear < 0.5 * error()
 
 
 def test_a_part_that_is_not_seen_brings_nothing_together():
