@@ -42,6 +42,7 @@ _PENALTY = 4.0  # score of one parameter
 _RARE = {"screw": 24.0, "cylindrical": 24.0, "spherical": 24.0}  # score of a type that few objects have
 _EXPLAINED = 3.0  # chi^2 per observed number that is still put down to the noise
 _MAX_POINTS = 500
+_THIN_LEVER = 0.1  # of the part's radius; more, and less, served some states of a pair of scissors worse
 _LEAST_LEVER = 0.005  # of the object's radius
 _UNDETERMINED_AXIS = math.radians(15)
 _UNDETERMINED_ORIGIN = 0.25  # of the object's radius
@@ -52,11 +53,13 @@ def surface_noise(points: Tensor, noise: float, object_radius: float) -> Tensor:
     """Covariance [6, 6] of a motion about the centroid of points [N, 3], known to `noise` x `object_radius` at them.
 
     The variance times the inverse of the quadratic form whose value at a small motion is the points' mean squared
-    displacement. The lever of a turn is at least 0.005 of the object's radius, as for a rod that turns about itself.
+    displacement. The lever of a turn is at least a tenth of the part's own radius, as of a thin rod's about itself,
+    which shading tells, and 0.005 of the object's.
     """
     x = points - points.mean(0)
     C = x.mT @ x / x.shape[0]
-    inertia = (C.trace() + (_LEAST_LEVER * object_radius) ** 2) * torch.eye(3).to(C) - C
+    lever2 = (_THIN_LEVER**2 * C.trace()).clamp_min((_LEAST_LEVER * object_radius) ** 2)
+    inertia = (C.trace() + lever2) * torch.eye(3).to(C) - C
     return (noise * object_radius) ** 2 * torch.block_diag(torch.eye(3).to(C), torch.linalg.inv(inertia))
 
 

@@ -54,6 +54,16 @@ CASES = [
 ]
 
 
+def test_the_turn_of_a_thin_part_about_itself_is_known_as_by_a_tenth_of_its_radius():
+    rod = torch.linspace(-0.5, 0.5, 101).double()[:, None] * torch.tensor([1.0, 0.0, 0.0]).double()
+    radius = float(rod.square().sum(1).mean().sqrt())
+    about_itself, across, _ = surface_noise(rod, 0.003, 1.0).diagonal()[3:].sqrt()
+    assert float(about_itself) == pytest.approx(0.003 / (0.1 * radius))
+    assert float(across) == pytest.approx(0.003 / radius, rel=0.01)
+    speck = surface_noise(1e-4 * rod, 0.003, 1.0).diagonal()[3:].sqrt()
+    assert speck == pytest.approx(torch.full((3,), 0.003 / 0.005).numpy(), rel=1e-3)
+
+
 @given(seed=st.integers(0, 2**31), case=st.sampled_from(CASES))
 @settings(max_examples=15, deadline=None)
 def test_exact_motions_give_the_exact_joint(seed, case):
