@@ -11,22 +11,26 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.view import View
-from splatart_ns.geometry.se3 import inverse, so3_log, transform_points
+from splatart_ns.geometry.se3 import inverse, se3_log, so3_log, transform_points
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.covisibility import compared_by_common, covisible
 from splatart_ns.stages.flush import compared_by_seen, in_sight, is_flush, surface_depths, without_neighbours
 from splatart_ns.stages.free_space import FreeSpace, without_haze
 from splatart_ns.stages.joint import PRISMATIC_BELOW
 from splatart_ns.stages.part_pair import IN_EVEN_LIGHT, PartPair, part_pair
-from splatart_ns.stages.refinement import motion_covariance, refine, rotation_held_ratio, shifted
+from splatart_ns.stages.refinement import Refinement, motion_covariance, refine, rotation_held_ratio, shifted
 from splatart_ns.stages.render_choice import FINE_PIXELS, VIEWS
-from splatart_ns.stages.symmetry import settle_turn
+from splatart_ns.stages.symmetry import DIP, settle_turn
 from splatart_ns.stages.visibility import clearest
 
 ALL_VIEWS = 60
 """Views of each state that the last refinement looks at, where there are so many."""
 MAX_ITERATIONS = 16
 """Most parts take 1 to 5; a shut door that begins 3 % of the object off took 14."""
+SLIPPED = math.radians(5)
+"""Refining that turns a part by more from where a sweep put it has left what told that."""
+LOST = math.radians(2 * DIP)
+"""Nor was anything told where the two ways of looking are further apart than a dip is wide."""
 MAYBE_SLIDING = math.radians(10)
 """A part that turned less than this against another may be sliding: thin parts' turns are known no better."""
 
@@ -98,8 +102,10 @@ def refine_poses(
                 T[s, p], equations = found.T, found.equations
             turned, untold = settle_turn((splats[0], splats[s]), (views[0], views[s]), p + 1, T[s, p])
             if not torch.equal(turned, T[s, p]):
-                found = refine(pair, turned, MAX_ITERATIONS, central=central)
-                T[s, p], equations = found.T, found.equations
+                ends = refine(pair, turned, MAX_ITERATIONS, central=central)
+                if not untold.any():
+                    ends, untold = _held_by_brightness(pair, T[s, p], turned, ends, central)
+                T[s, p], found, equations = ends.T, ends, ends.equations
             covariances[s, p] = motion_covariance(pair, T[s, p], equations) + untold
             if something_rests and not frozen[s, p]:
                 refined += 1
@@ -111,6 +117,25 @@ def refine_poses(
             for s, (slid, covariance) in slides.items():
                 T[s, p], covariances[s, p] = slid, covariance
     return T, covariances
+
+
+def _held_by_brightness(
+    pair: PartPair, T: Tensor, told: Tensor, ends: Refinement, central: bool
+) -> tuple[Refinement, Tensor]:
+    """Where a round part's pose T [4, 4] ends that brightness told to be turned to `told`, and how uncertain that is
+    [6, 6]; `ends`: where refining put it from there.
+
+    In even light its turn may not show, and refining slips off it. Then the pose is refined on brightness as it is.
+    That has light in it: by how far the two are apart it may be off. If it is too far, nothing is told, and T stays.
+    """
+    if so3_log(ends.T[:3, :3] @ told[:3, :3].mT).norm() < SLIPPED:
+        return ends, torch.zeros(6, 6).to(told)
+    bright = refine(replace(pair, even_light=False), told, MAX_ITERATIONS, central=central)
+    slip = se3_log(ends.T @ inverse(bright.T))
+    angle = slip[3:].norm()
+    if angle > LOST:
+        return refine(pair, T, 0), math.pi**2 / 3 * (slip / angle).outer(slip / angle)
+    return bright, slip.outer(slip)
 
 
 def _may_have_slid(pair: PartPair, T: Tensor) -> bool:

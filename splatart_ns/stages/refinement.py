@@ -60,7 +60,7 @@ def refine(
     T = T.double()
     n = 3 if hold_rotation else 7 if with_scale else 6
     damping, converged = 1e-3, False
-    equations = _normal_equations(pair, T, n, central)
+    equations = normal_equations(pair, T, n, central)
     iteration = 0
     while iteration < max_iterations and not converged:
         iteration += 1
@@ -72,7 +72,7 @@ def refine(
         if cost < equations.cost:
             converged = bool(step.abs().max() < 0.1 * STEP) or cost > (1 - 1e-4) * equations.cost
             T, damping = trial, damping * 0.3
-            equations = equations.after(step, cost) if converged else _normal_equations(pair, T, n, central)
+            equations = equations.after(step, cost) if converged else normal_equations(pair, T, n, central)
         else:
             damping = max(damping, 1e-3) * 10
             converged = damping > 1e2 or bool(step.abs().max() < 0.1 * STEP)
@@ -122,7 +122,8 @@ def linearized(difference: Tensor, weight: Tensor, step: float, central: bool = 
 
 
 @torch.no_grad()
-def _normal_equations(pair: PartPair, T: Tensor, n: int, central: bool = False) -> NormalEquations:
+def normal_equations(pair: PartPair, T: Tensor, n: int, central: bool = False) -> NormalEquations:
+    """Of the first n of translation, rotation and logarithm of a scale, at T [4, 4]; see `increment` and `refine`."""
     steps = trial_steps(n, central, T)
     motions = increment(T.expand(len(steps), 4, 4), steps, pair.centroid, pair.radius)
     H, gradients, costs = zip(
@@ -145,7 +146,7 @@ def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | No
     what no image shows, like the turn of a plain round part about its axis.
     """
     T = T.double()
-    equations = equations or _normal_equations(pair, T, 6)
+    equations = equations or normal_equations(pair, T, 6)
     # Mean squared residual of one of the 4 channels; a perfect fit has none.
     variance = max(equations.cost / 2, 1e-9)
     V, n = equations.g.shape

@@ -5,6 +5,10 @@ stood still, like its light. Only what is drawn on it or sticks out tells the tu
 angle: a narrow one, where that of light is wide. So all angles are tried. The axis must be exact for that, as turning
 about one that is a degree off costs more than the dip is deep: it is taken from the motion between the part's pose and
 its pose after half a turn, refined.
+
+Near the axis are principal ones across which the moments are similar, and that of the motion to which the silhouettes
+are all but blind: of a wheel under its fork, or a lens whose back no view shows, Gaussians are missing, and the moments
+do not tell it.
 """
 
 from __future__ import annotations
@@ -17,17 +21,24 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.view import View
-from splatart_ns.geometry.se3 import inverse, se3_exp, se3_log, skew, so3_log
+from splatart_ns.geometry.se3 import inverse, se3_exp, se3_log, skew, so3_log, transform_points
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import CHROMA_WEIGHT, PartPair, part_pair
-from splatart_ns.stages.refinement import increment, refine
-from splatart_ns.stages.render_choice import COARSE_PIXELS, VIEWS
+from splatart_ns.stages.refinement import normal_equations, refine
+from splatart_ns.stages.render_choice import COARSE_PIXELS, DOUBTFUL_VIEWS, VIEWS
 from splatart_ns.stages.symmetric_turns import similar_axes
 
 MAYBE_ROUND = 0.03
 """Turning them about their principal axis raises the cost per pixel by less than this."""
 ROUND = 0.01
 """About their exact axis, by less than this: discs measured 0.001 to 0.003, what is not round 0.02 to 0.5."""
+BLIND = 0.1
+"""Silhouettes are blind to a turn that they weigh by less than this share of what they weigh the median motion by; the
+turns of a lens and of four wheels they weigh by 0.005 to 0.02."""
+MOSTLY = 0.5
+"""Least share of rotation in such a motion, its translation in radii: axes of wheels hidden by half miss the centroid."""
+SAME_AXIS = 20
+"""Degrees between axes that are one."""
 STEP = 5
 """Degrees between the turns that are tried."""
 DIP = 10
@@ -59,27 +70,29 @@ def settle_turn(
     """
     T = T.double()
     untold = torch.zeros(6, 6).to(T)
-    axes = similar_axes(splats[0].select(splats[0].part_ids == part))
-    pair = part_pair(splats, views, part, VIEWS, COARSE_PIXELS) if len(axes) else None
+    pair = part_pair(splats, views, part, VIEWS, COARSE_PIXELS)
     if pair is None:
         return T, untold
     pair = replace(pair, chroma_weight=CHROMA_WEIGHT)
-    for axis in axes.to(T):
-        twist = _axis_of_symmetry(pair, T, axis)
+    axes = T.new_zeros(0, 3)
+    for guess in torch.cat([_unseen_turns(pair, T), _similar_turns(pair, T)]):
+        if bool((axes @ guess[3:] > math.cos(math.radians(SAME_AXIS))).any()):
+            continue
+        twist = _axis_of_symmetry(pair, T, guess)
         if twist is None:
             continue
-        # Light makes no narrow dip, so brightness may count in full.
-        angles, cost = _swept(replace(pair, brightness_weight=1.0), T, twist)
-        best = int(cost.argmin())
-        apart = (angles - angles[best] + math.pi).remainder(2 * math.pi) - math.pi
-        rival = cost[apart.abs() > math.radians(DIP + 0.5 * STEP)].amin()
-        told = rival > TOLD * cost[best] and rival - cost[best] > TOLD_SHARE * (cost.amax() - cost[best])
+        axes = torch.cat([axes, twist[None, 3:], -twist[None, 3:]])
+        # What tells may show in few views, or not in those few.
+        for count in (VIEWS, DOUBTFUL_VIEWS):
+            angle, told = _told_turn(part_pair(splats, views, part, count, COARSE_PIXELS), T, twist)
+            if told:
+                break
         if not told:
             untold = untold + math.pi**2 / 3 * twist.outer(twist)
             back = se3_exp(_least_turn(T, twist) * twist) @ T
             T = back if so3_log(back[:3, :3]).norm() < math.radians(UNTURNED) else T
-        elif min(best, len(cost) - best) * STEP > DIP:
-            T = se3_exp(angles[best] * twist) @ T
+        elif abs(math.remainder(angle, 2 * math.pi)) > math.radians(DIP + 0.5 * STEP):
+            T = se3_exp(angle * twist) @ T
     return T, untold
 
 
@@ -92,21 +105,51 @@ def _least_turn(T: Tensor, twist: Tensor) -> Tensor:
     return torch.atan2((skew(w) @ R).trace(), R.trace() - w @ R @ w)
 
 
-def _axis_of_symmetry(pair: PartPair, T: Tensor, axis: Tensor) -> Tensor | None:
+def _similar_turns(pair: PartPair, T: Tensor) -> Tensor:
+    """Twists [K, 6] of unit rotation about the part's `similar_axes` through its centroid, in the target's world."""
+    axes = similar_axes(pair.splats[0]).to(T) @ T[:3, :3].mT
+    pivot = transform_points(T, pair.centroid[None])
+    return torch.cat([torch.linalg.cross(pivot.expand_as(axes), axes), axes], -1)
+
+
+def _unseen_turns(pair: PartPair, T: Tensor) -> Tensor:
+    """Twists [K, 6] of unit rotation, in the target's world, of the turns to which the silhouettes are blind."""
+    silhouettes = replace(pair, chroma_weight=0.0, brightness_weight=0.0)
+    weights, motions = torch.linalg.eigh(normal_equations(silhouettes, T, 6).H.sum(0))
+    motions = motions.mT[weights < BLIND * weights[3]]
+    share = motions[:, 3:].norm(dim=-1, keepdim=True)
+    shift, axes = (x[share[:, 0] > MOSTLY] for x in (pair.radius * motions[:, :3] / share, motions[:, 3:] / share))
+    shift = shift - (shift * axes).sum(-1, keepdim=True) * axes
+    pivot = transform_points(T, pair.centroid[None])
+    return torch.cat([shift + torch.linalg.cross(pivot.expand_as(axes), axes), axes], -1)
+
+
+def _axis_of_symmetry(pair: PartPair, T: Tensor, guess: Tensor) -> Tensor | None:
     """The twist [6] of unit rotation about the part's axis of symmetry in the target's world; None if it is not round.
 
-    `axis` [3]: near it, in the source's world.
+    `guess` [6]: one near it.
     """
-    turn = torch.cat([torch.zeros(3).to(T), T[:3, :3] @ axis])
-    angles = torch.arange(0, 360, 30).to(T).deg2rad()
-    cost = pair.cost(increment(T.expand(len(angles), 4, 4), angles[:, None] * turn, pair.centroid, pair.radius))
+    cost = pair.cost(se3_exp(torch.arange(0, 360, 30).to(T).deg2rad()[:, None] * guess) @ T)
     if cost.amax() - cost.amin() > MAYBE_ROUND:
         return None
-    half = refine(pair, increment(T, math.pi * turn, pair.centroid, pair.radius)).T
-    twist = se3_log(half @ inverse(T))
-    twist = twist / twist[3:].norm()
-    cost = _swept(pair, T, twist)[1]
-    return twist if cost.amax() - cost.amin() < ROUND else None
+    half = se3_log(refine(pair, se3_exp(math.pi * guess) @ T).T @ inverse(T))
+    # Half a turn of a part that is hidden by half shows the other half.
+    for twist in (half / half[3:].norm(), guess):
+        cost = _swept(pair, T, twist)[1]
+        if cost.amax() - cost.amin() < ROUND:
+            return twist
+    return None
+
+
+def _told_turn(pair: PartPair, T: Tensor, twist: Tensor) -> tuple[float, bool]:
+    """The best angle about a twist [6] after T, and whether the images tell it."""
+    # Light makes no narrow dip, so brightness may count in full.
+    angles, cost = _swept(replace(pair, chroma_weight=CHROMA_WEIGHT, brightness_weight=1.0), T, twist)
+    best = int(cost.argmin())
+    apart = (angles - angles[best] + math.pi).remainder(2 * math.pi) - math.pi
+    rival = cost[apart.abs() > math.radians(DIP + 0.5 * STEP)].amin()
+    told = rival > TOLD * cost[best] and rival - cost[best] > TOLD_SHARE * (cost.amax() - cost[best])
+    return float(angles[best]), bool(told)
 
 
 def _swept(pair: PartPair, T: Tensor, twist: Tensor) -> tuple[Tensor, Tensor]:

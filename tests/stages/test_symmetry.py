@@ -5,8 +5,13 @@ import torch
 from part_scene import angle_deg, box, disc, inverse, motion, photograph
 
 from splatart_ns.geometry.se3 import se3_exp
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages import pose_evidence, symmetry
 from splatart_ns.stages.joint import fit_joint
+from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.pose_evidence import refine_poses
+from splatart_ns.stages.refinement import Refinement
+from splatart_ns.stages.render_choice import DOUBTFUL_VIEWS, VIEWS
 from splatart_ns.stages.symmetry import settle_turn
 from splatart_ns.stages.unseen import may_have_turned
 
@@ -72,6 +77,47 @@ def test_a_plain_round_part_that_also_turned_otherwise_stays_where_it_was_put():
     assert untold.any()
 
 
+@pytest.fixture(scope="module")
+def under_a_fork():
+    """A plain disc under a part that rests: where no view looks behind that, the disc has no Gaussians."""
+    fork = box(1, (0.2, 0.6, 0.3), (0.0, 0.3, 0.0)).transformed(TILT)
+    splats, views = [], []
+    for T in (EYE, TURNED):
+        whole = disc(2, T @ TILT)
+        beside, above, _ = ((whole.means.double() - TILT[:3, 3]) @ TILT[:3, :3]).T
+        views.append(photograph(Splat.cat([fork, whole])))
+        splats.append(Splat.cat([fork, whole.select((beside.abs() > 0.1) | (above < 0))]))
+    return splats, views
+
+
+def test_the_turn_of_a_round_part_that_is_hidden_in_part_is_untold(under_a_fork, monkeypatch):
+    monkeypatch.setattr(symmetry, "similar_axes", lambda splat: torch.zeros(0, 3))  # as of more than is hidden here
+    splats, views = under_a_fork
+    settled, untold = settle_turn(splats, views, 2, EYE)
+    assert torch.equal(settled, EYE)
+    assert float(untold[3:, 3:].trace()) == pytest.approx(math.pi**2 / 3, rel=1e-6)
+    twist = torch.linalg.eigh(untold).eigenvectors[:, -1]
+    twist = twist / twist[3:].norm()
+    assert abs(float(twist[3:] @ TILT[:3, 2])) > math.cos(math.radians(3))
+    assert (twist[:3] + torch.linalg.cross(twist[3:], TILT[:3, 3])).norm() < 0.03  # the disc's own centre stays
+
+
+def test_what_tells_a_turn_in_some_of_the_views_does(monkeypatch):
+    """A mark that the few views of the first looks miss: they are of a plain disc."""
+    plain, marked = scene(disc, TURNED), scene(disc, TURNED, mark=True)
+    looks = []
+
+    def looked(splats, views, part, count, pixels):
+        looks.append(count)
+        return part_pair(*(marked if count == DOUBTFUL_VIEWS else plain), part, VIEWS, pixels)
+
+    monkeypatch.setattr(symmetry, "part_pair", looked)
+    settled, untold = settle_turn(*plain, 2, EYE)
+    assert looks == [VIEWS, VIEWS, DOUBTFUL_VIEWS]
+    assert angle_deg(settled, TURNED) < 6
+    assert not untold.any()
+
+
 def test_a_mark_on_a_round_part_tells_its_turn():
     splats, views = scene(disc, TURNED, mark=True)
     for T in (EYE, TURNED):
@@ -109,3 +155,26 @@ def test_a_marked_disc_that_seems_still_is_turned_to_where_its_mark_is():
     T, covariance = poses(*scene(disc, TURNED, mark=True), EYE)
     assert angle_deg(T[1, 1], TURNED) < 6  # so near with 10 views of 64 pixels and its light against it
     assert not may_have_turned(covariance[:, 1]).any()
+
+
+@pytest.mark.parametrize(("slip", "held"), [(8, True), (40, False)])
+def test_a_turn_that_even_light_does_not_tell_is_as_uncertain_as_it_slips(plain, monkeypatch, slip, held):
+    about = TILT @ motion((0, 0, -slip), (0, 0, 0)) @ inverse(TILT)
+
+    def ends(pair, T, *_, **__):
+        return Refinement(about @ T if pair.even_light else T, 0.0, True, 1, None)
+
+    def covariance(pair, T, equations=None):
+        return torch.zeros(6, 6).to(T)
+
+    monkeypatch.setattr(pose_evidence, "settle_turn", lambda *_: (TURNED, torch.zeros(6, 6).double()))
+    monkeypatch.setattr(pose_evidence, "refine", ends)
+    monkeypatch.setattr(pose_evidence, "motion_covariance", covariance)
+    T, uncertain = poses(*plain, about @ TURNED)
+    sigma = torch.linalg.eigvalsh(uncertain[1, 1, 3:, 3:])[-1].sqrt()
+    if held:
+        assert torch.allclose(T[1, 1], TURNED)
+        assert math.degrees(float(sigma)) == pytest.approx(slip)
+    else:
+        assert angle_deg(T[1, 1], TURNED) == pytest.approx(2 * slip)  # as it came, and even light turns it once more
+        assert float(sigma) == pytest.approx(math.pi / math.sqrt(3))
