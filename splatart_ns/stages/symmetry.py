@@ -36,7 +36,7 @@ BLIND = 0.1
 """Silhouettes are blind to a turn that they weigh by less than this share of what they weigh the median motion by; the
 turns of a lens and of four wheels they weigh by 0.005 to 0.02."""
 MOSTLY = 0.5
-"""Least share of rotation in such a motion, its translation in radii: axes of wheels hidden by half miss the centroid."""
+"""Least share of rotation in such a motion, its translation in radii: axes of half-hidden wheels miss the centroid."""
 SAME_AXIS = 20
 """Degrees between axes that are one."""
 STEP = 5
