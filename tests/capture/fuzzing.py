@@ -15,11 +15,13 @@ from splatart_ns.errors import InputError
 EXAMPLES = int(os.environ.get("SPLATART_FUZZ_EXAMPLES", "30"))
 
 
-def fuzzed(test, examples: int = EXAMPLES):
-    """Settings of a fuzz test: the same examples each time, unless many are asked for."""
+def fuzzed(test, one_in: int = 1):
+    """Settings of a fuzz test: the same examples each time, and of a slow one only some, unless many are asked for."""
+    many = EXAMPLES >= 1000
+    examples = EXAMPLES if many else EXAMPLES // one_in
     unchecked = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large]
     quiet = {"deadline": None, "suppress_health_check": unchecked}
-    return settings(max_examples=examples, derandomize=EXAMPLES < 1000, **quiet)(test)
+    return settings(max_examples=examples, derandomize=not many, **quiet)(test)
 
 
 STRANGE = [
