@@ -70,7 +70,7 @@ def _about_unseen_axis(fit: JointFit, points: Tensor, T_rel: Tensor, C: Tensor, 
     values, sigma = so3_log(T_rel[:, :3, :3]) @ axis, variances[:, -1].sqrt()
     if values[values.abs().argmax()] < 0:
         axis, values = -axis, -values
-    values = values.where((sigma < UNSEEN_ROTATION) & (values > SURE * sigma), 0)
+    values = values.where((sigma < UNSEEN_ROTATION) & (values.abs() > SURE * sigma), 0)
     least = HARDLY_SEEN if values.any() else UNSEEN_ROTATION
     if (variances[state] > least**2).sum() != 1:
         return fit
