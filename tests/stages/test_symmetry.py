@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -100,6 +101,15 @@ def test_the_turn_of_a_round_part_that_is_hidden_in_part_is_untold(under_a_fork,
     twist = twist / twist[3:].norm()
     assert abs(float(twist[3:] @ TILT[:3, 2])) > math.cos(math.radians(3))
     assert (twist[:3] + torch.linalg.cross(twist[3:], TILT[:3, 3])).norm() < 0.03  # the disc's own centre stays
+
+
+def test_of_a_part_that_turned_otherwise_silhouettes_are_not_asked(under_a_fork, monkeypatch):
+    monkeypatch.setattr(symmetry, "similar_axes", lambda splat: torch.zeros(0, 3))
+    splats, views = under_a_fork
+    carried = motion((40, 0, 0), (0, 0, 0))
+    moved = [replace(v, viewmat=v.viewmat @ inverse(carried).to(v.viewmat)) for v in views[1]]
+    settled, untold = settle_turn((splats[0], splats[1].transformed(carried)), (views[0], moved), 2, carried)
+    assert torch.equal(settled, carried) and not untold.any()
 
 
 def test_what_tells_a_turn_in_some_of_the_views_does(monkeypatch):
