@@ -30,8 +30,8 @@ class WorldFit:
     T: Tensor
     """The similarity [4, 4] float64 that brings the state's world to that of state 0."""
     covariance: Tensor
-    """[7, 7] float64 of its inverse, about the origin: translation, rotation, logarithm of the scale (0 where it was
-    given); see `motion_covariance`."""
+    """[7, 7] float64 of a small similarity after it, about the origin of state 0's world: translation, rotation,
+    logarithm of the scale (0 where it was given); see `motion_covariance`."""
     ratio: float
     """How much worse the part's images fit than with each state's own Gaussians."""
 
