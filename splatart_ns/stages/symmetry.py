@@ -35,7 +35,7 @@ ROUND = 0.01
 """About their exact axis, by less than this: discs measured 0.001 to 0.003, what is not round 0.02 to 0.5."""
 BLIND = 0.1
 """Silhouettes are blind to a turn that they weigh by less than this share of what they weigh the median motion by; the
-turns of a lens and of four wheels they weigh by 0.005 to 0.02."""
+turns of a lens and of two wheels they weigh by 0.005 to 0.02."""
 MOSTLY = 0.5
 """Least share of rotation in such a motion, its translation in radii: axes of half-hidden wheels miss the centroid."""
 SAME_AXIS = 20
@@ -86,11 +86,9 @@ def settle_turn(
         if twist is None:
             continue
         axes = torch.cat([axes, twist[None, 3:], -twist[None, 3:]])
-        # What tells may show in few views, or not in those few.
-        for count in (VIEWS, DOUBTFUL_VIEWS):
-            angle, told = _told_turn(part_pair(splats, views, part, count, COARSE_PIXELS), T, twist)
-            if told:
-                break
+        angle, told = _told_turn(pair, T, twist)
+        if not told:  # what tells it may not show in so few views
+            angle, told = _told_turn(part_pair(splats, views, part, DOUBTFUL_VIEWS, COARSE_PIXELS), T, twist)
         if not told:
             untold = untold + math.pi**2 / 3 * twist.outer(twist)
             back = se3_exp(_least_turn(T, twist) * twist) @ T
@@ -137,7 +135,7 @@ def _axis_of_symmetry(pair: PartPair, T: Tensor, guess: Tensor) -> Tensor | None
     if cost.amax() - cost.amin() > MAYBE_ROUND:
         return None
     half = se3_log(refine(pair, se3_exp(math.pi * guess) @ T).T @ inverse(T))
-    # Half a turn of a part that is hidden by half shows the other half.
+    # Half a turn of a part that is hidden in part brings to light where it has no Gaussians.
     for twist in (half / half[3:].norm(), guess):
         cost = _swept(pair, T, twist)[1]
         if cost.amax() - cost.amin() < ROUND:

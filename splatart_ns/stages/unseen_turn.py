@@ -34,7 +34,8 @@ def turned_unseen(
     errors: Mapping[int, Tensor],
     constraints: Sequence[JointConstraint] = (),
 ) -> KinematicTree:
-    """The tree, where parts that rest on their parents, but may have turned about one axis, hang on joints about that.
+    """The tree, where parts that seem to rest on their parents, but may have turned about one axis, or did so by an
+    angle that is hardly told, hang on joints about that.
 
     Args:
         tree: Joints that were fitted to what is seen.
@@ -54,8 +55,8 @@ def turned_unseen(
             relative = errors[joint.child] + (0 if stood_still(joint.parent, motions) else errors[joint.parent])
             C, E = (to_parent @ x.to(to_parent) @ to_parent.mT for x in (covariances[joint.child], relative))
             T_rel = inverse(motions[joint.parent].double()) @ motions[joint.child].double()
-            told = points[joint.child].to(C), T_rel.to(C), C.nan_to_num(), E
-            joint = replace(joint, fit=_about_unseen_axis(joint.fit, *told))
+            seen = points[joint.child].to(C), T_rel.to(C), C.nan_to_num(), E
+            joint = replace(joint, fit=_about_unseen_axis(joint.fit, *seen))
         joints.append(joint)
     return replace(tree, joints=joints)
 
@@ -87,7 +88,7 @@ def _about_unseen_axis(fit: JointFit, points: Tensor, T_rel: Tensor, C: Tensor, 
         "axis_origin": moves_axis @ rest @ moves_origin.mT,
         "values": (variances[:, -1] * (variances[:, -1] > least**2)).diag(),
     }
-    told = "by how much it did is told by light alone" if values.any() else "whether it did is undetermined"
+    known = "by how much it did is hardly told" if values.any() else "whether it did is undetermined"
     others = {other["type"]: other for other in fit.alternatives}
     others[fit.type] = {"type": fit.type, "residual": fit.residual, "score": fit.score}
     score = others.pop("revolute", {}).get("score", math.inf)
@@ -99,5 +100,5 @@ def _about_unseen_axis(fit: JointFit, points: Tensor, T_rel: Tensor, C: Tensor, 
         covariance={name: block.tolist() for name, block in covariance.items()},
         ambiguous=True,
         alternatives=sorted(others.values(), key=lambda other: other["score"]),
-        undetermined=[f"The part looks alike however it turns about its axis, so {told}."],
+        undetermined=[f"The part looks alike however it turns about its axis, so {known}."],
     )

@@ -113,7 +113,7 @@ def test_of_a_part_that_turned_otherwise_silhouettes_are_not_asked(under_a_fork,
 
 
 def test_what_tells_a_turn_in_some_of_the_views_does(monkeypatch):
-    """A mark that the few views of the first looks miss: they are of a plain disc."""
+    """A mark that the few views of the first look miss: they are of a plain disc."""
     plain, marked = scene(disc, TURNED), scene(disc, TURNED, mark=True)
     looks = []
 
@@ -123,7 +123,7 @@ def test_what_tells_a_turn_in_some_of_the_views_does(monkeypatch):
 
     monkeypatch.setattr(symmetry, "part_pair", looked)
     settled, untold = settle_turn(*plain, 2, EYE)
-    assert looks == [VIEWS, VIEWS, DOUBTFUL_VIEWS]
+    assert looks == [VIEWS, DOUBTFUL_VIEWS]
     assert angle_deg(settled, TURNED) < 6
     assert not untold.any()
 
