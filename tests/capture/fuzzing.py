@@ -18,7 +18,7 @@ EXAMPLES = int(os.environ.get("SPLATART_FUZZ_EXAMPLES", "30"))
 def fuzzed(test, one_in: int = 1):
     """Settings of a fuzz test: the same examples each time, and of a slow one only some, unless many are asked for."""
     many = EXAMPLES >= 1000
-    examples = EXAMPLES if many else EXAMPLES // one_in
+    examples = EXAMPLES if many else max(1, EXAMPLES // one_in)
     unchecked = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large]
     quiet = {"deadline": None, "suppress_health_check": unchecked}
     return settings(max_examples=examples, derandomize=not many, **quiet)(test)
