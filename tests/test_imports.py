@@ -14,13 +14,14 @@ BELOW = {
     "machine": set(),
     "plain_yaml": set(),
     "shape": set(),
+    "threads": set(),
     "files": {"errors"},
     "records": {"errors"},
     "geometry": {"errors"},
     "splats": {"errors", "files", "geometry"},
-    "rasterize": {"errors", "geometry", "splats"},
+    "rasterize": {"errors", "geometry", "splats", "threads"},
     "capture": {"errors", "files", "geometry", "plain_yaml"},
-    "stages": {"capture", "errors", "geometry", "rasterize", "splats"},
+    "stages": {"capture", "errors", "geometry", "rasterize", "splats", "threads"},
 }
 BELOW["bundle"] = BELOW["stages"] | {"files", "records", "stages"}
 BELOW["evaluation"] = BELOW["bundle"] | {"bundle"}

@@ -110,12 +110,12 @@ class Companions:
 def _serve(source: BinaryIO, tell: Callable[[str, Any], None]) -> None:
     """The process: train what `Companion.train` sends, until the other end closes the pipe or dies."""
     with few_imports():
-        import torch
         from nerfstudio.utils.rich_utils import CONSOLE
 
         from splatart_ns.plugin.semantic import SemanticModel  # noqa: F401  (the stage that has several runs)
         from splatart_ns.plugin.stage_run import run_stage
         from splatart_ns.rasterize.rasterization import set_backend
+        from splatart_ns.threads import kernel_threads
 
     runs: queue.SimpleQueue[tuple[TrainerConfig, Backend, int]] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(source, runs), daemon=True).start()
@@ -131,9 +131,9 @@ def _serve(source: BinaryIO, tell: Callable[[str, Any], None]) -> None:
     while True:
         config, backend, threads = runs.get()
         set_backend(backend)
-        torch.set_num_threads(threads)
         try:
-            tell("outcome", run_stage(config, on_step))
+            with kernel_threads(threads):
+                tell("outcome", run_stage(config, on_step))
         except InputError as error:
             tell("input error", str(error))
 

@@ -26,6 +26,7 @@ from splatart_ns.capture.digest import capture_digest
 from splatart_ns.capture.values import is_inside
 from splatart_ns.errors import InputError
 from splatart_ns.files import write_json
+from splatart_ns.machine import num_cores
 from splatart_ns.method_configs.joint import method as joint_method
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.method_configs.semantic import method as semantic_method
@@ -35,6 +36,7 @@ from splatart_ns.plugin.stage_run import num_processes, run_side_by_side, run_st
 from splatart_ns.rasterize.rasterization import Backend, default_backend, set_backend
 from splatart_ns.shape import NUMBER, has_shape, parse
 from splatart_ns.stages.joint_constraint import parse_constraints
+from splatart_ns.threads import kernel_threads
 
 Quality = Literal["draft", "standard", "high"]
 
@@ -93,7 +95,7 @@ def report_head(capture: Capture, settings: Settings) -> dict[str, Any]:
         "seed": settings.seed,
         "device": "cuda: " + torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
         "rasterizer": default_backend(),
-        "threads": torch.get_num_threads(),
+        "threads": num_cores(),
         "versions": {"python": platform.python_version()}
         | {name: version(name) for name in ("splatart-ns", "nerfstudio", "torch", "gsplat", "numpy")},
     }
@@ -191,7 +193,7 @@ def fit(
 
     configs = stage_configs(capture, output_dir, settings)
     pose, joint = (configs.pop(name) for name in ("pose", "joint"))
-    with _progress() as progress:
+    with kernel_threads(num_cores()), _progress() as progress:
         _train(configs, rasterizer, report, progress, companions)
         _train({"pose": pose}, rasterizer, report, progress)
         _train({"joint": joint}, rasterizer, report, progress, whole=_is_whole(output_dir))

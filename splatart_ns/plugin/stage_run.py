@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 from queue import SimpleQueue
 
@@ -20,6 +20,7 @@ from splatart_ns.machine import num_cores
 from splatart_ns.plugin.companion import Companion, Companions, Outcome
 from splatart_ns.plugin.compat import seed_everything, stop_event_writers
 from splatart_ns.rasterize.rasterization import Backend
+from splatart_ns.threads import kernel_threads
 
 
 def run_stage(config: TrainerConfig, on_step: Callable[[int], None]) -> Outcome:
@@ -92,7 +93,7 @@ def run_side_by_side(
             raise failed[0]
         on_step(index, steps)
 
-    with companions, _torch_threads(threads):
+    with companions, kernel_threads(threads):
         for companion in companions.first(min(processes, len(configs)) - 1):
             threading.Thread(target=train_beside, args=(companion,), daemon=True).start()
         outcomes: dict[int, Outcome] = {}
@@ -108,17 +109,6 @@ def run_side_by_side(
                 while following in outcomes:
                     yield outcomes.pop(following)
                     following += 1
-
-
-@contextmanager
-def _torch_threads(count: int) -> Iterator[None]:
-    """So many threads of torch, and of the rasterizer."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _peak_memory_mb() -> int:

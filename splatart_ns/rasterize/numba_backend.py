@@ -20,7 +20,8 @@ from splatart_ns.rasterize.numba_compositing import (
     composite_neighbours,
     gather_gradients,
 )
-from splatart_ns.rasterize.numba_runtime import balanced_bounds, even_bounds, num_workers, run
+from splatart_ns.rasterize.numba_runtime import balanced_bounds, even_bounds, run
+from splatart_ns.threads import num_threads
 
 
 def rasterize_to_pixels(
@@ -59,7 +60,7 @@ def rasterize_neighbours(
     means_, conics_, colors_, visible_ = (_array(t) for t in (means2d, conics, colors, visible))
     bins = bin_gaussians(means_[0], conics_[0], _array(opacities), _array(depths[0]), visible_[0], 1, width, height)
     images = np.empty((len(colors), height, width, 4), np.float32)
-    bounds = balanced_bounds(bins.tile_offsets, num_workers())
+    bounds = balanced_bounds(bins.tile_offsets, num_threads())
     run(composite_neighbours, bounds, bins, means_, conics_, colors_, visible_, images)
     return torch.from_numpy(images)
 
@@ -77,7 +78,7 @@ class _Rasterize(torch.autograd.Function):
         render = np.empty((C, height, width, D), np.float32)
         alphas = np.empty((C, height, width, 1), np.float32)
         used = np.empty(len(bins.tile_offsets) - 1, np.int64)
-        bounds = balanced_bounds(bins.tile_offsets, num_workers())
+        bounds = balanced_bounds(bins.tile_offsets, num_threads())
         run(composite, bounds, bins, colors_, render, alphas, used)
         ctx.means2d = means2d if absgrad else None
         ctx.state = bins, colors_, used, (C, N, D)
@@ -92,7 +93,7 @@ class _Rasterize(torch.autograd.Function):
         drawn = np.empty(len(bins.pairs), bool)
         moments = np.empty((len(bins.pairs) if wants[0] else 0, 8 if wants[1] else 6), np.float32)
         pair_colors = np.empty((len(bins.pairs) if wants[2] else 0, colors.shape[1]), np.float32)
-        bounds = balanced_bounds(np.concatenate([[0], np.cumsum(used)]), num_workers())
+        bounds = balanced_bounds(np.concatenate([[0], np.cumsum(used)]), num_threads())
         run(
             composite_backward,
             bounds,
@@ -109,7 +110,7 @@ class _Rasterize(torch.autograd.Function):
 
         widths = (2, 3, 1, D if wants[2] else 0, 2 if wants[1] else 0)
         gradients = [np.zeros((C * N, width), np.float32) for width in widths]
-        bounds = even_bounds(len(bins.order), num_workers())
+        bounds = even_bounds(len(bins.order), num_threads())
         run(gather_gradients, bounds, bins, drawn, moments, pair_colors, wants, *gradients)
         *gradients, absolute = (torch.from_numpy(gradient).unflatten(0, (C, N)) for gradient in gradients)
         if wants[1]:

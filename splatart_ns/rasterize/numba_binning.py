@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splatart_ns.rasterize.numba_runtime import even_bounds, jit, num_workers, run
+from splatart_ns.rasterize.numba_runtime import even_bounds, jit, run
+from splatart_ns.threads import num_threads
 
 TILE = 8
 """Side of a tile, pixels."""
@@ -217,7 +218,7 @@ def bin_gaussians(means, conics, opacities, depths, visible, cameras: int, width
     total = means.shape[0]
     per_camera = total // max(cameras, 1)
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    workers = num_workers()
+    workers = num_threads()
     coefficients = np.empty((total, 6))
     ellipses = np.empty((total, 3))
     rows = np.empty((total, 2), np.int32)

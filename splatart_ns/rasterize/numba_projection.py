@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from splatart_ns.rasterize.numba_runtime import even_bounds, jit, num_workers, run
+from splatart_ns.rasterize.numba_runtime import even_bounds, jit, run
 from splatart_ns.rasterize.projection import LARGEST_RADIUS, LEAST_QUATERNION, Projection
+from splatart_ns.threads import num_threads
 
 _BLOCK = 256
 """Gaussians whose gradients by the cameras are summed together."""
@@ -48,7 +49,7 @@ class _Project(torch.autograd.Function):
         means2d, depths = np.empty((C, N, 2), np.float32), np.empty((C, N), np.float32)
         conics, compensations = np.empty((C, N, 3), np.float32), np.empty((C, N), np.float32)
         results = radii, means2d, depths, conics, compensations
-        run(_project, even_bounds(N, num_workers()), means_, quats_, scales_, cameras, settings, *results)
+        run(_project, even_bounds(N, num_threads()), means_, quats_, scales_, cameras, settings, *results)
         ctx.state = means_, quats_, scales_, cameras, settings
         radii, *results = (torch.from_numpy(result) for result in results)
         ctx.mark_non_differentiable(radii)
@@ -65,7 +66,7 @@ class _Project(torch.autograd.Function):
         v_cameras = np.zeros((blocks, C, 12))
         run(
             _project_backward,
-            even_bounds(blocks, num_workers()),
+            even_bounds(blocks, num_threads()),
             *(means, quats, scales, cameras, settings),
             *incoming,
             *(v_means, v_quats, v_scales, v_cameras),

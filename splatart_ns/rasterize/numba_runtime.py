@@ -11,7 +11,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-import torch
 from numba import njit
 
 _pool: ThreadPoolExecutor | None = None
@@ -33,11 +32,6 @@ def jit(function: Callable) -> Callable:
         return njit(cache=True, **options)(function)
     except RuntimeError:  # numba finds no folder for its cache
         return njit(**options)(function)
-
-
-def num_workers() -> int:
-    """Number of threads to use: torch's setting for the calling thread."""
-    return torch.get_num_threads()
 
 
 def run(kernel: Callable, bounds: np.ndarray, *args) -> list:

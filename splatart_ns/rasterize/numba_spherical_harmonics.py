@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from splatart_ns.rasterize.numba_runtime import even_bounds, jit, num_workers, run
+from splatart_ns.rasterize.numba_runtime import even_bounds, jit, run
+from splatart_ns.threads import num_threads
 
 _C0 = np.float32(0.5 / math.sqrt(math.pi))
 _C1 = np.float32(math.sqrt(3 / (4 * math.pi)))
@@ -32,7 +33,7 @@ class _Colors(torch.autograd.Function):
         C, N = len(centers), len(means)
         arrays = [t.detach().contiguous().numpy() for t in (means, sh if sh.ndim == 4 else sh[None], centers)]
         colors = np.empty((C, N, 3), np.float32)
-        run(_colors, even_bounds(N, num_workers()), *arrays, degree, colors)
+        run(_colors, even_bounds(N, num_threads()), *arrays, degree, colors)
         ctx.state = arrays, colors, degree, sh.shape
         return torch.from_numpy(colors)
 
@@ -43,7 +44,7 @@ class _Colors(torch.autograd.Function):
         need_means, need_sh, need_centers, _ = ctx.needs_input_grad
         v_offsets = np.empty((len(centers) if need_means or need_centers else 0, *means.shape), np.float32)
         v_sh = np.empty(sh.shape if need_sh else (0, 0, 0, 0), np.float32)
-        bounds = even_bounds(len(means), num_workers())
+        bounds = even_bounds(len(means), num_threads())
         run(
             _colors_backward, bounds, means, sh, centers, degree, colors, v_colors.contiguous().numpy(), v_offsets, v_sh
         )

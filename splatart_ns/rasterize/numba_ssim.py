@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatart_ns.rasterize.numba_runtime import even_bounds, jit, num_workers, run
+from splatart_ns.rasterize.numba_runtime import even_bounds, jit, run
+from splatart_ns.threads import num_threads
 
 _TAPS = 11
 _BLOCK = 240
@@ -131,11 +132,11 @@ def ssim_and_gradient(
     rows, columns = height - len(windows[0]) + 1, 3 * (width - len(windows[1]) + 1)
     sums = np.empty(rows)
     slopes = np.empty((3, rows, columns), np.float32)
-    run(_similarity, even_bounds(rows, num_workers()), x, y, down, across, sums, slopes)
+    run(_similarity, even_bounds(rows, num_threads()), x, y, down, across, sums, slopes)
     value = float(sums.sum() / (rows * columns))
     if factors is None:
         return value, None
     scales = np.float32(factors[0] / (rows * columns)), np.float32(factors[1] / x.size)
     gradient = np.empty_like(x)
-    run(_gradient, even_bounds(height, num_workers()), x, y, down, across, slopes, *scales, gradient)
+    run(_gradient, even_bounds(height, num_threads()), x, y, down, across, slopes, *scales, gradient)
     return value, gradient.reshape(image.shape)

@@ -22,8 +22,8 @@ from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.covisibility import share_left
 from splatart_ns.stages.part_pair import PartPair, best_views
-from splatart_ns.stages.threads import side_by_side
 from splatart_ns.stages.visibility import MAX_VIEWS
+from splatart_ns.threads import side_by_side
 
 FLUSH = 0.6
 """A part is flush where the images show more than this share of its border against other parts: links of robots have

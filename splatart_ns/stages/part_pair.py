@@ -17,7 +17,7 @@ from splatart_ns.geometry.similarity import inverse_similarity, view_of_moved
 from splatart_ns.rasterize.rasterization import rasterization, rasterize_neighbours, sh_colors
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.light import difference_in_even_light
-from splatart_ns.stages.threads import side_by_side
+from splatart_ns.threads import side_by_side
 
 Measure = TypeVar("Measure")
 RGB_WEIGHT = 0.3

@@ -14,6 +14,7 @@ from torch import Tensor
 from splatart_ns.geometry.spherical_harmonics import SH_C0
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.visibility import shown
+from splatart_ns.threads import num_threads
 
 MIN_POINTS = 8
 """A part with fewer Gaussians than this in a state cannot be registered."""
@@ -222,7 +223,7 @@ def _icp_step(
 ) -> np.ndarray:
     """One step of every motion: nearest points, trimming, the rigid fit (Kabsch 1976); without `turn` its slide."""
     moved = _moved_features(T, sample, colour)
-    distance, nearest = target_tree.query(moved, eps=NEARLY, workers=torch.get_num_threads())
+    distance, nearest = target_tree.query(moved, eps=NEARLY, workers=num_threads())
     inlier = distance <= np.quantile(distance, 1 - trim, axis=1, keepdims=True)
     w = inlier / inlier.sum(axis=1, keepdims=True)
     goal = target.xyz[nearest]
@@ -241,6 +242,6 @@ def _icp_step(
 
 
 def _trimmed_distance(T: np.ndarray, sample: PartPoints, colour: float, tree: cKDTree, trim: float) -> np.ndarray:
-    distance = tree.query(_moved_features(T, sample, colour), workers=torch.get_num_threads())[0]
+    distance = tree.query(_moved_features(T, sample, colour), workers=num_threads())[0]
     distance = np.sort(distance, axis=1)
     return distance[:, : max(1, round((1 - trim) * distance.shape[1]))].mean(axis=1)

@@ -19,6 +19,7 @@ from splatart_ns.capture.seen_surface import SeenSurface, agreed, cells, grid, n
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.rasterize.rasterization import has_numba
+from splatart_ns.threads import num_threads
 
 PASSES = 3
 """With 5 places lie nearly as near the truth."""
@@ -40,7 +41,7 @@ def stereo_surface(views: Sequence[View], voxels: Tensor, size: float) -> SeenSu
     """
     if len(views) < 3 or not has_numba():
         return SeenSurface.nothing()
-    from splatart_ns.rasterize.numba_runtime import even_bounds, num_workers, run
+    from splatart_ns.rasterize.numba_runtime import even_bounds, run
     from splatart_ns.stages.patch_match import HIDDEN, match
 
     shown = [object_pixels(view) for view in views]
@@ -58,7 +59,7 @@ def stereo_surface(views: Sequence[View], voxels: Tensor, size: float) -> SeenSu
     given = [x.contiguous().numpy() for x in (K, others, T[..., :3, :3], T[..., :3, 3], *bounds.unbind(1))]
     depth, normals = np.zeros(given[-1].shape, np.float32), np.zeros((*given[-1].shape, 3), np.float32)
     unlike = np.full_like(depth, 2.0)
-    workers = even_bounds(len(views), min(num_workers(), len(views)))
+    workers = even_bounds(len(views), min(num_threads(), len(views)))
     run(match, workers, bright, *given, stride, PASSES, depth, normals, unlike)
     depth = torch.from_numpy(np.where(unlike < UNLIKE, depth, np.inf))
     return agreed(views, others, depth, torch.from_numpy(normals), stride)

@@ -17,7 +17,7 @@ from torch import Tensor
 from splatart_ns.capture.view import View
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.threads import side_by_side
+from splatart_ns.threads import side_by_side
 
 ROUNDS = 5
 """All in one cost 0.2 dB more at the same number of Gaussians; eight, no less than four."""

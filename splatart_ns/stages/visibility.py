@@ -12,7 +12,7 @@ from torch import Tensor
 from splatart_ns.capture.view import View
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.threads import side_by_side
+from splatart_ns.threads import side_by_side
 
 MAX_VIEWS = 40
 """More views than this add nothing to the answer."""

@@ -3,7 +3,7 @@ import threading
 import pytest
 import torch
 
-from splatart_ns.stages.threads import side_by_side
+from splatart_ns.threads import kernel_threads, num_threads, side_by_side
 
 
 @pytest.fixture
@@ -46,3 +46,26 @@ def test_an_error_of_an_item_reaches_the_caller(two_threads):
     with pytest.raises(ZeroDivisionError):
         side_by_side(lambda item: 1 / item, [1, 0])
     assert torch.get_num_threads() == 2
+
+
+def test_kernels_and_views_have_threads_where_torch_has_one(two_threads):
+    at_once = threading.Barrier(3, timeout=20)
+
+    def function(item: int) -> tuple[int, int]:
+        at_once.wait()
+        return num_threads(), torch.get_num_threads()
+
+    assert num_threads() == 2
+    with kernel_threads(3):
+        assert (num_threads(), torch.get_num_threads()) == (3, 1)
+        assert side_by_side(function, range(3)) == [(1, 1)] * 3
+        assert (num_threads(), torch.get_num_threads()) == (3, 1)
+    assert (num_threads(), torch.get_num_threads()) == (2, 2)
+
+
+def test_threads_are_as_before_after_an_error_too(two_threads):
+    with kernel_threads(3):
+        with pytest.raises(ValueError, match="nothing"), kernel_threads(4):
+            raise ValueError("nothing")
+        assert num_threads() == 3
+    assert (num_threads(), torch.get_num_threads()) == (2, 2)
