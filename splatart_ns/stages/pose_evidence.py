@@ -72,40 +72,26 @@ def refine_poses(
     S, P = T.shape[:2]
     covariances = torch.zeros(S, P, 6, 6, dtype=torch.float64, device=T.device)
     something_rests = bool(frozen.all(0).any())
-    clear = clear or [clearest(*state) for state in zip(splats, views, strict=True)]
-    common = [covisible(*((x[0], x[s]) for x in (splats, views, clear)), T[s]) for s in range(1, S)]
-    depths = cache(lambda s: surface_depths(splats[s], views[s]))
-    free = cache(lambda s: FreeSpace.of(views[s]))
+    comparison = _Comparison(splats, views, T, clear)
     for p in range(P):
         refined, slides = 0, {}
-        flush = [is_flush(some, p + 1) for some in views]
         for s in range(1, S):
-            compared = views[0], views[s]
-            if flush[0] or flush[s]:
-                compared = tuple(
-                    [without_neighbours(v, d, p + 1) for v, d in zip(views[t], depths(t), strict=True)] for t in (0, s)
-                )
-            pair = part_pair((splats[0], splats[s]), compared, p + 1, ALL_VIEWS, FINE_PIXELS, near=True)
+            pair, equations = comparison.pair(p + 1, s, T[s, p]), None
             if pair is None:
                 covariances[s, p] = torch.nan
                 continue
-            of_part = [both[x.part_ids == p + 1] for both, x in zip(common[s - 1], (splats[0], splats[s]), strict=True)]
-            pair, equations = compared_by_common(replace(pair, **IN_EVEN_LIGHT), of_part), None
-            if flush[0] or flush[s]:
-                seen = [in_sight(x, views[t], depths(t), p + 1) for x, t in zip(pair.splats, (0, s), strict=True)]
-                pair = compared_by_seen(pair, T[s, p], seen)
             if not frozen[s, p]:
                 found = refine(pair, T[s, p], MAX_ITERATIONS, central=central)
-                clearer = pair if flush[0] or flush[s] else without_haze(pair, found.T, (free(0), free(s)))
+                clearer = comparison.without_haze(pair, p + 1, s, found.T)
                 if clearer is not pair:
                     pair, found = clearer, refine(clearer, found.T, MAX_ITERATIONS, central=central)
                 T[s, p], equations = found.T, found.equations
             turned, untold = settle_turn((splats[0], splats[s]), (views[0], views[s]), p + 1, T[s, p])
             if not torch.equal(turned, T[s, p]):
-                ends = refine(pair, turned, MAX_ITERATIONS, central=central)
+                found = refine(pair, turned, MAX_ITERATIONS, central=central)
                 if not untold.any():
-                    ends, untold = _held_by_brightness(pair, T[s, p], turned, ends, central)
-                T[s, p], found, equations = ends.T, ends, ends.equations
+                    found, untold = _held_by_brightness(pair, T[s, p], turned, found, central)
+                T[s, p], equations = found.T, found.equations
             covariances[s, p] = motion_covariance(pair, T[s, p], equations) + untold
             if something_rests and not frozen[s, p]:
                 refined += 1
@@ -117,6 +103,53 @@ def refine_poses(
             for s, (slid, covariance) in slides.items():
                 T[s, p], covariances[s, p] = slid, covariance
     return T, covariances
+
+
+class _Comparison:
+    """How parts of state 0 and of another are compared in all views; what they share is measured once."""
+
+    def __init__(
+        self,
+        splats: Sequence[Splat],
+        views: Sequence[Sequence[View]],
+        T: Tensor,
+        clear: Sequence[Tensor] | None,
+    ):
+        self._splats, self._views = splats, views
+        clear = clear or [clearest(*state) for state in zip(splats, views, strict=True)]
+        self._common = [covisible(*((x[0], x[s]) for x in (splats, views, clear)), T[s]) for s in range(1, len(splats))]
+        self._depths = cache(lambda s: surface_depths(splats[s], views[s]))
+        self._free = cache(lambda s: FreeSpace.of(views[s]))
+        self._is_flush = cache(lambda part, s: is_flush(views[s], part))
+
+    def _lies_flush(self, part: int, s: int) -> bool:
+        return self._is_flush(part, 0) or self._is_flush(part, s)
+
+    def pair(self, part: int, s: int, T: Tensor) -> PartPair | None:
+        """A part at states 0 and s, about the motion T [4, 4] between them; None where no labelled view shows it."""
+        states, flush = (0, s), self._lies_flush(part, s)
+        compared = [self._views[t] for t in states]
+        if flush:
+            compared = [
+                [without_neighbours(v, d, part) for v, d in zip(some, self._depths(t), strict=True)]
+                for t, some in zip(states, compared, strict=True)
+            ]
+        splats = self._splats[0], self._splats[s]
+        pair = part_pair(splats, tuple(compared), part, ALL_VIEWS, FINE_PIXELS, near=True)
+        if pair is None:
+            return None
+        of_part = [both[x.part_ids == part] for both, x in zip(self._common[s - 1], splats, strict=True)]
+        pair = compared_by_common(replace(pair, **IN_EVEN_LIGHT), of_part)
+        if flush:
+            seen = [
+                in_sight(x, self._views[t], self._depths(t), part) for t, x in zip(states, pair.splats, strict=True)
+            ]
+            pair = compared_by_seen(pair, T, seen)
+        return pair
+
+    def without_haze(self, pair: PartPair, part: int, s: int, T: Tensor) -> PartPair:
+        """A `pair` that has been refined to T [4, 4]; the same one where there is no haze, or the part lies flush."""
+        return pair if self._lies_flush(part, s) else without_haze(pair, T, (self._free(0), self._free(s)))
 
 
 def _held_by_brightness(
