@@ -49,6 +49,8 @@ SLIDE_TURN = 6.0
 """Degrees by which a slide may seem to turn."""
 TURNED_OVER = math.radians(90)
 """To a motion that turns a part by more a slide is preferred that looks alike."""
+HALF_TURN = math.radians(170)
+"""What turns by more makes half a turn; to one that does, one that makes less is preferred while in doubt."""
 PITCHED, UNPITCHED = 0.1, 0.03
 """A motion that shifts a part by more than the first along its axis, in part radii, is no mere turn; one that shifts it
 by less than the second is."""
@@ -57,6 +59,9 @@ SIMILAR_TURN = 1.5
 ALIKE = 1.25
 """Motions that cost less than this many times the chosen one render as well: plain square knobs turned by 90 degrees
 more measured 1.08 to 1.18, hexagonal ones 1.03 to 1.12, other parts that are seen well above 2."""
+DOUBTFUL = 2.0
+"""Where a motion that turns the part quite otherwise costs less than this many times the chosen one, more views choose:
+doors were seen to cost 1.4 times as much as turned over, in few views or as they are lit."""
 STILL_RATIO = 1.2
 """A part whose images fit no motion worse than this many times the best motion did not move."""
 SHADED_RATIO = 2.0
@@ -128,7 +133,7 @@ def initial_motion(
     known = torch.from_numpy(T[order]).to(identity)
     moved = identity_cost >= STILL_RATIO * ends[order[0]].cost
     turned = turned_alike(tiny, coarse, known[0]) if moved else known[:0]
-    if len(turned) or moved and any(looks_alike(T, cost, order[0], i) for i in order):
+    if len(turned) or moved and any(looks_alike(T, cost, order[0], i, DOUBTFUL) for i in order):
         coarse, fine = (part_pair(splats, views, part, DOUBTFUL_VIEWS, n) for n in (COARSE_PIXELS, FINE_PIXELS))
         identity_cost = float(fine.cost(identity[None])[0])
         ends = refined(coarse, fine, choose(coarse, torch.cat([known, turned, candidates]), SIMILAR))
@@ -184,14 +189,15 @@ def ranked(pair: PartPair, ends: Sequence[Refinement]) -> tuple[np.ndarray, np.n
     T = torch.stack([e.T for e in ends])
     cost, T = appearance_cost(pair, T), T.cpu().numpy()
     order = prefer_slide(T, cost, distinct(T, cost, pair.centroid.cpu().numpy(), pair.radius))
-    return T, cost, prefer_turn(T, cost, order, pair.radius)
+    return T, cost, prefer_less_turn(T, cost, prefer_turn(T, cost, order, pair.radius))
 
 
-def looks_alike(T: np.ndarray, cost: np.ndarray, chosen: int, other: int) -> bool:
-    """Whether of motions [C, 4, 4] that cost [C] the `other` turns the part quite otherwise and renders as well."""
+def looks_alike(T: np.ndarray, cost: np.ndarray, chosen: int, other: int, times: float = ALIKE) -> bool:
+    """Whether of motions [C, 4, 4] that cost [C] the `other` turns the part quite otherwise and costs less than so many
+    `times` as much."""
     turned = Rotation.from_matrix(T[chosen, :3, :3].T @ T[other, :3, :3]).magnitude()
     # Half of what is quite another one: a hexagonal part looks alike after 60 degrees.
-    return bool(turned > OTHERWISE / 2 and cost[other] < ALIKE * cost[chosen])
+    return bool(turned > OTHERWISE / 2 and cost[other] < times * cost[chosen])
 
 
 def search(pair: PartPair, T: Tensor) -> Tensor:
@@ -217,7 +223,7 @@ def prefer_slide(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]
 
     Where one state hides most of a part, no motion fits well: a drawer was seen to render a tenth better turned over.
     """
-    turn = np.arccos(((np.einsum("cii->c", T[:, :3, :3]) - 1) / 2).clip(-1, 1))
+    turn = _angles(T)
     slides = [i for i in order if turn[i] < math.radians(SLIDE_TURN) and cost[i] < ALIKE * cost[order[0]]]
     if turn[order[0]] < TURNED_OVER or not slides:
         return order
@@ -242,6 +248,28 @@ def prefer_turn(T: np.ndarray, cost: np.ndarray, order: list[int], radius: float
         return order
     turns = [i for i in order if shift(i) < UNPITCHED and cost[i] < SIMILAR_TURN * cost[best]]
     return [*turns[:1], *(i for i in order if i not in turns[:1])]
+
+
+def prefer_less_turn(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]:
+    """`order` of motions [C, 4, 4] by cost [C]: before half a turn comes less of one that differs by half a turn.
+
+    By whatever angle a plate turns about a hinge, once it is turned over, about a line across the hinge, it seems to
+    have made half a turn, about the line between where that one was and is. Parts that do make half a turn are rare.
+    Motions by which no hinge is told, and those that cost `DOUBTFUL` times as much, are not preferred.
+    """
+    first, turn = order[0], _angles(T)
+    if turn[first] < HALF_TURN:
+        return order
+    hinged = (
+        (math.pi - HALF_TURN < turn) & (turn < HALF_TURN) & (_angles(T[first, :3, :3].T @ T[:, :3, :3]) > HALF_TURN)
+    )
+    less = [i for i in order if hinged[i] and cost[i] < DOUBTFUL * cost[first]]
+    return [*less[:1], *(i for i in order if i not in less[:1])]
+
+
+def _angles(T: np.ndarray) -> np.ndarray:
+    """By how much motions [C, 4, 4] turn: radians [C]."""
+    return Rotation.from_matrix(T[:, :3, :3]).magnitude()
 
 
 def appearance_cost(pair: PartPair, T: Tensor) -> np.ndarray:

@@ -9,10 +9,15 @@ from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.registration import part_points, register
 from splatart_ns.stages.render_choice import (
     ALIKE,
+    DOUBTFUL,
+    FINE_PIXELS,
     SHADED_RATIO,
     STILL_RATIO,
+    VIEWS,
+    appearance_cost,
     choose,
     initial_motion,
+    prefer_less_turn,
     prefer_slide,
     prefer_turn,
     ranked,
@@ -192,6 +197,45 @@ def test_a_slide_that_fits_nearly_as_well_is_preferred_to_turning_over():
     assert prefer_slide(T, np.array([1.0, 1.05, 0.98 * ALIKE]), [0, 1, 2]) == [2, 0, 1]
     assert prefer_slide(T, np.array([1.0, 1.05, 1.3]), [0, 1, 2]) == [0, 1, 2]
     assert prefer_slide(T, np.array([1.1, 1.0, 1.15]), [1, 0, 2]) == [1, 0, 2]
+
+
+@pytest.mark.parametrize(
+    "turn, over, cost, preferred",
+    [
+        (47, (0, 0, 180), 1.5, True),
+        (47, (0, 0, 180), 2.5, False),
+        (3, (0, 0, 180), 1.5, False),
+        (90, (0, 85, 0), 1.5, False),
+        (47, (0, 60, 0), 0.9, True),
+    ],
+    ids=["a flap turned over", "it fits much worse", "no hinge", "a knob of four sides", "the better one is the less"],
+)
+def test_less_than_half_a_turn_is_preferred_to_the_part_turned_over(turn, over, cost, preferred):
+    less = motion((0, turn, 0), (0, 0, 0))
+    T = torch.stack([less @ motion(over, (0, 0, 0)), less]).numpy()
+    order = sorted((0, 1), key=lambda i: (1.0, cost)[i])
+    assert prefer_less_turn(T, np.array([1.0, cost]), order)[0] == int(preferred)
+
+
+def test_a_lid_that_is_lit_from_one_side_is_not_turned_over():
+    """Opened it is lit from below, so that it fits better turned over, though its sides have another colour each."""
+    T = motion((60, 0, 0), (0.0, 0.1, 0.3))
+    lid = box(1, (0.6, 0.4, 0.06), (0.0, 0.0, 0.0), spacing=0.04)
+    above, front = lid.means[:, 2, None, None] > 0, lid.means[:, 1, None, None] > 0.1
+    colour = torch.where(above, 0.2, -0.2) * torch.tensor([1.0, -0.5, -0.5])
+    colour = colour + torch.where(front, 0.4, 0.0) * torch.tensor([-0.5, 1.0, -0.5])
+    opened = lid.transformed(T)
+    lid.sh, opened.sh = (torch.where(lit, 0.5, -0.1) + colour for lit in (above, ~above))
+    splats = lid, opened
+    views = tuple(photograph(s, count=20) for s in splats)
+    seen = tuple(visibility(s, v) for s, v in zip(splats, views, strict=True))
+    found = initial_motion(splats, views, seen, part=1)
+    assert angle_deg(found.T, T) < 2
+    (over,) = found.alike
+    assert angle_deg(over, T) > 170
+    pair = part_pair(splats, views, 1, VIEWS, FINE_PIXELS)
+    right, turned_over = appearance_cost(pair, torch.stack([found.T, over]))
+    assert ALIKE * turned_over < right < DOUBTFUL * turned_over
 
 
 def test_where_all_candidates_turn_the_part_over_a_mere_shift_is_tried():
