@@ -48,7 +48,7 @@ SEARCH_STEPS = (0.6, 0.3, 0.15, 0.08)
 SLIDE_TURN = 6.0
 """Degrees by which a slide may seem to turn."""
 TURNED_OVER = math.radians(90)
-"""To a motion that turns a part by more a slide is preferred that looks alike."""
+"""A motion that turns a part by more is doubted, and a slide that looks alike is preferred to it."""
 HALF_TURN = math.radians(170)
 """What turns by more makes half a turn; to one that does, one that makes less is preferred while in doubt."""
 PITCHED, UNPITCHED = 0.1, 0.03
@@ -60,8 +60,8 @@ ALIKE = 1.25
 """Motions that cost less than this many times the chosen one render as well: plain square knobs turned by 90 degrees
 more measured 1.08 to 1.18, hexagonal ones 1.03 to 1.12, other parts that are seen well above 2."""
 DOUBTFUL = 2.0
-"""Where a motion that turns the part quite otherwise costs less than this many times the chosen one, more views choose:
-doors were seen to cost 1.4 times as much as turned over, in few views or as they are lit."""
+"""So many times in place of `ALIKE` where the chosen motion may turn the part over: doors were seen to cost 1.4 times
+as much as turned over, in few views or as they are lit."""
 STILL_RATIO = 1.2
 """A part whose images fit no motion worse than this many times the best motion did not move."""
 SHADED_RATIO = 2.0
@@ -133,7 +133,8 @@ def initial_motion(
     known = torch.from_numpy(T[order]).to(identity)
     moved = identity_cost >= STILL_RATIO * ends[order[0]].cost
     turned = turned_alike(tiny, coarse, known[0]) if moved else known[:0]
-    if len(turned) or moved and any(looks_alike(T, cost, order[0], i, DOUBTFUL) for i in order):
+    alike = DOUBTFUL if so3_log(known[0, :3, :3]).norm() > TURNED_OVER else ALIKE
+    if len(turned) or moved and any(looks_alike(T, cost, order[0], i, alike) for i in order):
         coarse, fine = (part_pair(splats, views, part, DOUBTFUL_VIEWS, n) for n in (COARSE_PIXELS, FINE_PIXELS))
         identity_cost = float(fine.cost(identity[None])[0])
         ends = refined(coarse, fine, choose(coarse, torch.cat([known, turned, candidates]), SIMILAR))
