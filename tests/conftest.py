@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-# Before torch is imported, as the commands do: on a busy machine, threads that wait by spinning are 20 times slower.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+from splatart_ns.machine import CALM_THREADS
+
+os.environ.update({**CALM_THREADS, **os.environ})  # as the commands do
 
 from splatart_ns.capture.procedural import synthesize_object
 from splatart_ns.capture.synthesis_options import SynthesisOptions

@@ -29,7 +29,7 @@ BELOW["viewer"] = BELOW["bundle"] | {"bundle"}
 BELOW["plugin"] = BELOW["bundle"] | {"bundle", "machine", "plain_yaml", "shape"}
 BELOW["batch"] = BELOW["plugin"] | {"plugin"}
 BELOW["method_configs"] = {"plugin"}
-BELOW["cli"] = {"batch", "bundle", "capture", "errors", "evaluation", "plugin", "rasterize", "viewer"}
+BELOW["cli"] = {"batch", "bundle", "capture", "errors", "evaluation", "machine", "plugin", "rasterize", "viewer"}
 """What each part of the package may import of the others."""
 
 ABOVE_THE_METHODS = {"splatart_ns/plugin/fit.py": {"method_configs"}}

@@ -1,3 +1,6 @@
+import os
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -69,3 +72,16 @@ def test_threads_are_as_before_after_an_error_too(two_threads):
             raise ValueError("nothing")
         assert num_threads() == 3
     assert (num_threads(), torch.get_num_threads()) == (2, 2)
+
+
+@pytest.mark.parametrize("module", ["splatart_ns.cli", "splatart_ns.plugin.companion"])
+def test_threads_of_a_command_do_not_wake_or_spin_for_small_work_unless_the_user_says_so(module):
+    def environment(**given):
+        names = "OMP_WAIT_POLICY", "OPENBLAS_NUM_THREADS"
+        rest = {name: value for name, value in os.environ.items() if name not in names}
+        code = f"import os, {module}; print(*map(os.environ.get, {names}))"
+        command = [sys.executable, "-c", code]
+        return subprocess.run(command, env=rest | given, capture_output=True, text=True, check=True).stdout.split()
+
+    assert environment() == ["PASSIVE", "1"]
+    assert environment(OPENBLAS_NUM_THREADS="3") == ["PASSIVE", "3"]

@@ -13,9 +13,9 @@ from multiprocessing.connection import Connection, wait
 from typing import IO, Any, Protocol
 
 from splatart_ns.batch.stage import Needs
-from splatart_ns.machine import memory_mb, num_cores, num_gpus
+from splatart_ns.machine import CALM_THREADS, memory_mb, num_cores, num_gpus
 
-THREADS = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+THREADS = {"OMP_NUM_THREADS": "1", **CALM_THREADS}
 """Environment of every stage, on whatever machine: sums depend on the number of threads."""
 _TASKS_PER_PROCESS = 200
 """Then a fresh process takes over, whatever libraries have piled up in the old one."""

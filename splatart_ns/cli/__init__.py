@@ -6,8 +6,9 @@ import os
 import sys
 import warnings
 
-# A spinning OpenMP pool makes two busy processes on one machine many times slower; it is read when torch is imported.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+from splatart_ns.machine import CALM_THREADS
+
+os.environ.update({**CALM_THREADS, **os.environ})
 
 import tyro
 

@@ -16,11 +16,11 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-# Of both ends; it is read when torch is imported. See splatart_ns/cli.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+from splatart_ns.machine import CALM_THREADS, num_cores, num_gpus
+
+os.environ.update({**CALM_THREADS, **os.environ})  # of both ends
 
 from splatart_ns.errors import InputError
-from splatart_ns.machine import num_cores, num_gpus
 from splatart_ns.plugin.imports import few_imports
 
 # Imported by the process that trains: who starts it need not wait for them.
