@@ -320,7 +320,9 @@ def find_mesh(name: str, urdf: Path) -> Path:
         for root in (above / package, above):
             if (root / rest).is_file():
                 return root / rest
-    raise InputError(f"{urdf}: {name} is not found in the folders above the URDF; put the package {package!r} there.")
+    found = [above / package for above in (folder, *folder.parents) if (above / package).is_dir()]
+    mend = f"{found[0]} has no {rest}; put that file there" if found else f"put the package {package!r} there"
+    raise InputError(f"{urdf}: {name} is not found in the folders above the URDF; {mend}.")
 
 
 def _origin(element: ElementTree.Element, path: Path) -> np.ndarray:

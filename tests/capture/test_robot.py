@@ -110,8 +110,10 @@ def test_package_paths_are_found_above_the_urdf(tmp_path):
     # A package that was unpacked under another name.
     assert find_mesh("package://other_name/meshes/a.stl", folder / "crane.urdf") == mesh
     assert find_mesh("../meshes/a.stl", folder / "crane.urdf").resolve() == mesh
-    with pytest.raises(InputError, match="'crane_description'"):
+    with pytest.raises(InputError, match="crane_description has no meshes/b.stl; put that file there"):
         find_mesh("package://crane_description/meshes/b.stl", folder / "crane.urdf")
+    with pytest.raises(InputError, match="put the package 'other_name' there"):
+        find_mesh("package://other_name/meshes/b.stl", folder / "crane.urdf")
 
 
 @pytest.mark.parametrize(
