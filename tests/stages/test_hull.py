@@ -10,12 +10,12 @@ from splatart_ns.stages.hull import (
     POINTS_PER_PART,
     POINTS_PER_PIXEL,
     carve,
+    likely_parts,
     seed_points,
     seen_surface,
     slack,
     surface,
     visual_hull,
-    vote_by_projection,
 )
 
 SIZE = (0.9, 0.6, 0.3)
@@ -62,18 +62,28 @@ def test_beyond_the_border_of_a_whole_view_is_outside_and_of_a_cut_view_unknown(
 
 def test_points_take_the_label_that_most_views_show():
     points = torch.tensor([[0.0, 0.0, 0.3], [0.4, 0.25, -0.2]])
-    assert vote_by_projection(VIEWS, points, 2).tolist() == [2, 1]
+    assert likely_parts(VIEWS, points, 0.05, 2).tolist() == [2, 1]
     silent = [replace(view, labels=None) for view in VIEWS]
-    assert vote_by_projection(silent, points, 2).tolist() == [0, 0]
+    assert likely_parts(silent, points, 0.05, 2).tolist() == [0, 0]
 
 
 def test_a_small_part_gets_its_least_number_of_points():
-    labels = vote_by_projection(VIEWS, seeds().xyz, 2)  # of 500 points, 250 each: it has a fortieth of the volume
+    labels = likely_parts(VIEWS, seeds().xyz, 0.03, 2)  # of 500 points, 250 each: it has a fortieth of the volume
     assert (labels == 2).sum() > 0.8 * 250
     fine = photograph(Splat.cat([BASE, KNOB]), count=6, pixels=240)
     points = started(fine, 4000, visual_hull(fine, resolution=40))
-    labels = vote_by_projection(fine, points.xyz, 2)
+    labels = likely_parts(fine, points.xyz, 0.03, 2)
     assert 0.8 * MIN_POINTS_PER_PART[2] < (labels == 2).sum() < 1.5 * MIN_POINTS_PER_PART[2]
+
+
+def test_a_small_part_that_half_of_the_views_see_nothing_of_gets_points_by_its_pixels():
+    button = box(2, (0.12, 0.12, 0.04), (0.1, 0.0, 0.07), spacing=0.02)
+    views = photograph(Splat.cat([BASE, button]), count=14, pixels=160)
+    hull = visual_hull(views)
+    points = started(views, 4000, hull)
+    above = ((points.xyz[:, :2] - torch.tensor([0.1, 0.0])).abs() < 0.1).all(-1) & (points.xyz[:, 2] > 0.06)
+    most = max(int((view.labels == 2).sum()) for view in views)
+    assert 4 * most < above.sum() < 8 * most
 
 
 def test_the_outermost_voxels_lack_a_neighbour():
