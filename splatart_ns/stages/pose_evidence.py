@@ -18,7 +18,14 @@ from splatart_ns.stages.flush import compared_by_seen, in_sight, is_flush, surfa
 from splatart_ns.stages.free_space import FreeSpace, without_haze
 from splatart_ns.stages.joint import PRISMATIC_BELOW
 from splatart_ns.stages.part_pair import IN_EVEN_LIGHT, PartPair, part_pair
-from splatart_ns.stages.refinement import Refinement, motion_covariance, refine, rotation_held_ratio, shifted
+from splatart_ns.stages.refinement import (
+    NormalEquations,
+    Refinement,
+    motion_covariance,
+    refine,
+    rotation_held_ratio,
+    shifted,
+)
 from splatart_ns.stages.render_choice import FINE_PIXELS, VIEWS
 from splatart_ns.stages.symmetry import DIP, settle_turn
 from splatart_ns.stages.visibility import clearest
@@ -31,6 +38,9 @@ SLIPPED = math.radians(5)
 """Refining that turns a part by more from where a sweep put it has left what told that."""
 LOST = math.radians(2 * DIP)
 """Nor was anything told where the two ways of looking are further apart than a dip is wide."""
+SLID = 5.0
+"""Standard deviations by which a part that seems to rest must have slid: parts that rest measured up to 2.3, round ones
+that turned up to 3.5, most buttons that were pressed by half a pixel to two 5 to 20."""
 MAYBE_SLIDING = math.radians(10)
 """A part that turned less than this against another may be sliding: thin parts' turns are known no better."""
 
@@ -80,7 +90,11 @@ def refine_poses(
             if pair is None:
                 covariances[s, p] = torch.nan
                 continue
-            if not frozen[s, p]:
+            if frozen[s, p]:
+                stays = refine(pair, T[s, p], 0, central=central)
+                found = _slid_a_little(pair, stays, central) or stays
+                T[s, p], equations = found.T, found.equations
+            else:
                 found = refine(pair, T[s, p], MAX_ITERATIONS, central=central)
                 clearer = comparison.without_haze(pair, p + 1, s, found.T)
                 if clearer is not pair:
@@ -103,6 +117,27 @@ def refine_poses(
             for s, (slid, covariance) in slides.items():
                 T[s, p], covariances[s, p] = slid, covariance
     return T, covariances
+
+
+def _slid_a_little(pair: PartPair, stays: Refinement, central: bool) -> Refinement | None:
+    """The slide of a part that seems to stay as it is, if it is one that no error explains.
+
+    Buttons move by a pixel or two, which hardly shows in what their images cost, but in all of them alike.
+    """
+    T, equations = stays.T, stays.equations
+    shift = NormalEquations(equations.H[:, :3, :3], equations.g[:, :3], equations.cost)
+    step = -torch.linalg.solve(shift.H.sum(0), shift.g.sum(0)) * pair.radius
+    if _deviations(step, motion_covariance(pair, T, shift)) < SLID:
+        return None
+    slide = shifted(pair, T, T[:3, :3], central)
+    moved = transform_points(slide.T, pair.centroid[None])[0] - transform_points(T, pair.centroid[None])[0]
+    surely = _deviations(moved, motion_covariance(pair, slide.T, slide.equations)) >= SLID
+    return slide if surely else None
+
+
+def _deviations(shift: Tensor, covariance: Tensor) -> float:
+    """How many standard deviations long a shift [3] is, by its covariance [6, 6]."""
+    return float((shift @ torch.linalg.solve(covariance[:3, :3], shift)).sqrt())
 
 
 class _Comparison:

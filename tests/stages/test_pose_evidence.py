@@ -1,3 +1,4 @@
+import pytest
 import torch
 from part_scene import angle_deg, motion, nearby, two_states
 
@@ -52,6 +53,22 @@ def test_a_part_that_slides_past_one_that_rests_is_held_unturned_and_one_that_tu
         assert (T[1, 1, :3, 3] - truth[:3, 3]).norm() < 0.01
 
 
+def test_a_part_that_seemed_to_rest_is_found_to_have_slid_by_a_quarter_of_a_pixel():
+    rest = torch.ones(2, 2, dtype=torch.bool)
+    slide = motion((0, 0, 0), (0.01, 0.005, 0.0))
+    T, covariance = refine_poses(*two_states(slide), poses_of(torch.eye(4).double()), rest)
+    assert (T[1, 1] - slide).abs().max() < 1e-3
+    assert torch.equal(T[1, 0], torch.eye(4).double())
+    assert (torch.linalg.eigvalsh(covariance[1, 1])[-3:] > 0).all()
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1.0])
+def test_a_part_that_rests_or_turned_a_little_is_not_slid(degrees):
+    rest = poses_of(torch.eye(4).double())
+    T, _ = refine_poses(*two_states(motion((0, 0, degrees), (0, 0, 0))), rest, torch.ones(2, 2, dtype=torch.bool))
+    assert torch.equal(T, rest)
+
+
 def test_the_last_refinement_looks_at_hues_and_at_brightness_in_even_light(monkeypatch):
     """What it gains was measured on fits (README); a scene as small as this one is held by its silhouettes."""
     looks = []
@@ -63,4 +80,4 @@ def test_the_last_refinement_looks_at_hues_and_at_brightness_in_even_light(monke
     monkeypatch.setattr(pose_evidence, "refine", watched)
     truth = motion((0, 0, 20), (0.1, 0.0, 0.0))
     refine_poses(*two_states(truth), poses_of(truth), torch.tensor([[True, True], [True, False]]))
-    assert looks == [(CHROMA_WEIGHT, 1.0, True)]
+    assert set(looks) == {(CHROMA_WEIGHT, 1.0, True)}
