@@ -30,6 +30,7 @@ from splatart_ns.plugin.semantic_run import find_semantic_runs, read_state
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.merge import merge_parts
+from splatart_ns.stages.neighbours import turned_as_neighbours_let
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import InitialMotion, initial_motion
@@ -211,10 +212,10 @@ class PosePipeline(VanillaPipeline):
                     found.setdefault((first, s), {})[p] = initial_motion(*pair, p + 1, self.config.seed)
         for (first, s), motions in found.items():
             ways = slide_ways(list(motions.values()))
-            for p, motion in motions.items():
-                if motion.alike:
-                    pair = [(everything[first], everything[s]) for everything in (splats, self.views)]
-                    motion = slid_alike(*pair, p + 1, motion, ways)
+            pair = [(everything[first], everything[s]) for everything in (splats, self.views)]
+            slid = {p + 1: slid_alike(*pair, p + 1, m, ways) if m.alike else m for p, m in motions.items()}
+            for part, motion in turned_as_neighbours_let(*pair, slid).items():
+                p = part - 1
                 M[s, p] = motion.T.cpu()
                 self._known[s, p] = motion.found
                 self._frozen[s, p] = not motion.found or (snap and motion.still)

@@ -84,7 +84,7 @@ class InitialMotion:
     identity_ratio: float = float("nan")
     """Cost of no motion over the best cost."""
     alike: tuple[Tensor, ...] = ()
-    """Motions [4, 4] that turn the part quite otherwise and render as well."""
+    """Motions [4, 4] that turn the part quite otherwise and render as well, the best first."""
 
 
 def initial_motion(
@@ -133,12 +133,14 @@ def initial_motion(
     known = torch.from_numpy(T[order]).to(identity)
     moved = identity_cost >= STILL_RATIO * ends[order[0]].cost
     turned = turned_alike(tiny, coarse, known[0]) if moved else known[:0]
-    alike = DOUBTFUL if so3_log(known[0, :3, :3]).norm() > TURNED_OVER else ALIKE
-    if len(turned) or moved and any(looks_alike(T, cost, order[0], i, alike) for i in order):
+    times = DOUBTFUL if so3_log(known[0, :3, :3]).norm() > TURNED_OVER else ALIKE
+    own = own_appearance(fine)
+    if len(turned) or moved and any(looks_alike(T, cost, order[0], i, own, times) for i in order):
         coarse, fine = (part_pair(splats, views, part, DOUBTFUL_VIEWS, n) for n in (COARSE_PIXELS, FINE_PIXELS))
         identity_cost = float(fine.cost(identity[None])[0])
         ends = refined(coarse, fine, choose(coarse, torch.cat([known, turned, candidates]), SIMILAR))
         T, cost, order = ranked(fine, ends)
+        own = own_appearance(fine)
     best = ends[order[0]]
     identity_ratio = identity_cost / max(best.cost, 1e-12)
     still = identity_ratio < STILL_RATIO
@@ -146,13 +148,14 @@ def initial_motion(
         even = part_pair(splats, views, part, DOUBTFUL_VIEWS, FINE_PIXELS)
         stayed, turned = replace(even, **IN_EVEN_LIGHT).cost(torch.stack([identity, best.T])).tolist()
         still = stayed < STILL_RATIO * turned
+    alike = () if still else tuple(ends[i].T for i in order if looks_alike(T, cost, order[0], i, own))
     return InitialMotion(
         identity if still else best.T,
         found=True,
         still=still,
         cost=best.cost,
         identity_ratio=identity_ratio,
-        alike=() if still else tuple(ends[i].T for i in order if looks_alike(T, cost, order[0], i)),
+        alike=alike,
     )
 
 
@@ -170,7 +173,34 @@ def turned_alike(tiny: PartPair, coarse: PartPair, T: Tensor) -> Tensor:
     nearest = [refine(coarse, near, 5).T for near in choose(coarse, turned, float("inf"))]
     ends = torch.stack([T, *nearest])
     cost, motions = appearance_cost(coarse, ends), ends.cpu().numpy()
-    return ends[[i for i in range(len(ends)) if looks_alike(motions, cost, 0, i)]]
+    own = own_appearance(coarse)
+    return ends[[i for i in range(len(ends)) if looks_alike(motions, cost, 0, i, own)]]
+
+
+def alike_in_even_light(
+    splats: tuple[Splat, Splat],
+    views: tuple[Sequence[View], Sequence[View]],
+    part: int,
+    T: Tensor,
+    candidates: Tensor,
+) -> list[Tensor]:
+    """Motions [4, 4] near `candidates` [C, 4, 4] that in even light render a part nearly as well as T [4, 4] does, the
+    best first.
+
+    In even light nothing is told by how what turned is lit, nor by how what is turned over would be.
+    """
+    if len(candidates) == 0:
+        return []
+    coarse = part_pair(splats, views, part, VIEWS, COARSE_PIXELS)
+    fine = part_pair(splats, views, part, DOUBTFUL_VIEWS, FINE_PIXELS)
+    if coarse is None or fine is None:
+        return []
+    even, evenly = (replace(pair, **IN_EVEN_LIGHT) for pair in (coarse, fine))
+    near = [refine(even, start, 5) for start in choose(coarse, candidates, float("inf"))]
+    least = min(end.cost for end in near)
+    ends = [refine(evenly, end.T, 10) for end in near if end.cost <= SIMILAR_TURN * least]
+    limit = ALIKE * refine(evenly, T, 10).cost
+    return [end.T for end in sorted(ends, key=lambda end: end.cost) if end.cost < limit]
 
 
 def refined(coarse: PartPair, fine: PartPair, candidates: Tensor) -> list[Refinement]:
@@ -179,7 +209,8 @@ def refined(coarse: PartPair, fine: PartPair, candidates: Tensor) -> list[Refine
     If the best turns the part over, a mere shift to the same place comes last, for `prefer_slide`.
     """
     if len(candidates) > 1:
-        candidates = choose(coarse, torch.stack([refine(coarse, T, 5).T for T in candidates]), 1.5)
+        near = torch.stack([refine(coarse, T, 5).T for T in candidates])
+        candidates = choose(coarse, near, 1.5, own=own_appearance(coarse))
     ends = [refine(fine, T, 10) for T in candidates]
     best = min(ends, key=lambda end: end.cost)
     return [*ends, shifted(fine, best.T)] if so3_log(best.T[:3, :3]).norm() > TURNED_OVER else ends
@@ -193,12 +224,14 @@ def ranked(pair: PartPair, ends: Sequence[Refinement]) -> tuple[np.ndarray, np.n
     return T, cost, prefer_less_turn(T, cost, prefer_turn(T, cost, order, pair.radius))
 
 
-def looks_alike(T: np.ndarray, cost: np.ndarray, chosen: int, other: int, times: float = ALIKE) -> bool:
+def looks_alike(
+    T: np.ndarray, cost: np.ndarray, chosen: int, other: int, own: float = 0.0, times: float = ALIKE
+) -> bool:
     """Whether of motions [C, 4, 4] that cost [C] the `other` turns the part quite otherwise and costs less than so many
-    `times` as much."""
+    `times` as much, or fits as each state's `own` Gaussians do."""
     turned = Rotation.from_matrix(T[chosen, :3, :3].T @ T[other, :3, :3]).magnitude()
     # Half of what is quite another one: a hexagonal part looks alike after 60 degrees.
-    return bool(turned > OTHERWISE / 2 and cost[other] < times * cost[chosen])
+    return bool(turned > OTHERWISE / 2 and cost[other] < max(times * cost[chosen], STILL_RATIO * own))
 
 
 def search(pair: PartPair, T: Tensor) -> Tensor:
@@ -278,11 +311,20 @@ def appearance_cost(pair: PartPair, T: Tensor) -> np.ndarray:
     return (0.5 * (pair.cost(T) + without_shading(pair).cost(T))).cpu().numpy()
 
 
-def choose(pair: PartPair, candidates: Tensor, similar: float, keep: int = 3) -> Tensor:
+def own_appearance(pair: PartPair) -> float:
+    """What `appearance_cost` would be if each state's Gaussians were looked at in their own state's views.
+
+    A motion that costs no more fits as well as any: what fits still better does so by what no image of its own state
+    shows, as a button that is turned over does by its back.
+    """
+    return 0.5 * (pair.own_cost() + without_shading(pair).own_cost())
+
+
+def choose(pair: PartPair, candidates: Tensor, similar: float, keep: int = 3, own: float = 0.0) -> Tensor:
     """The distinct motions [K, 4, 4] among `candidates` [C, 4, 4] that render best, best first.
 
     At most `keep`, and a few that turn the part quite otherwise: those may be one motion found several times. None
-    costs more than `similar` times the best.
+    costs more than `similar` times the best, but for what fits as each state's `own` Gaussians do.
     """
     cost = appearance_cost(pair, candidates)
     order = distinct(candidates.cpu().numpy(), cost, pair.centroid.cpu().numpy(), pair.radius)
@@ -291,4 +333,5 @@ def choose(pair: PartPair, candidates: Tensor, similar: float, keep: int = 3) ->
     for i in order[keep:]:
         if len(chosen) < keep + OTHERS and (R[chosen] * R[i].inv()).magnitude().min() > OTHERWISE:
             chosen.append(i)
-    return candidates[[i for i in chosen if cost[i] <= similar * cost[order[0]]]]
+    limit = max(similar * cost[order[0]], STILL_RATIO * own)
+    return candidates[[i for i in chosen if cost[i] <= limit]]

@@ -17,6 +17,8 @@ from splatart_ns.stages.render_choice import (
     appearance_cost,
     choose,
     initial_motion,
+    looks_alike,
+    own_appearance,
     prefer_less_turn,
     prefer_slide,
     prefer_turn,
@@ -62,6 +64,19 @@ def test_a_quite_different_motion_is_kept_beside_many_alike(scene):
     other = TRUTH @ motion((90, 0, 0), (0, 0, 0))
     kept = choose(pair, torch.stack([*alike, other]), similar=1e9)
     assert len(kept) == 4 and torch.equal(kept[-1], other)
+
+
+def test_what_fits_as_each_states_own_gaussians_do_is_kept_and_looks_alike_however_well_another_fits(scene):
+    splats, views, _ = scene
+    pair = part_pair(splats, views, 2, num_views=3, pixels=400)
+    other = TRUTH @ motion((90, 0, 0), (0, 0, 0))
+    motions = torch.stack([TRUTH, other])
+    cost = appearance_cost(pair, motions)
+    assert own_appearance(pair) == pytest.approx(cost[0], rel=0.02)  # nothing of this part is hidden in one state
+    for own, kept in ((cost[1], True), (0.8 * cost[1], False)):
+        assert len(choose(pair, motions, similar=1.5, own=own)) == 1 + kept
+        assert looks_alike(motions.numpy(), cost, 0, 1, own) == kept
+    assert not looks_alike(motions.numpy(), cost, 0, 0, cost[1])
 
 
 @pytest.mark.parametrize(

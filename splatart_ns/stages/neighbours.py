@@ -1,0 +1,145 @@
+"""Parts that turn as what they touch lets them: where the images accept several motions, a joint is what decides.
+
+A button, a knob or a lampshade looks alike turned over, and what no view of its own state shows, or the light, may even
+make it fit better so. But a joint seldom turns a part by more than a right angle against what it hangs on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from splatart_ns.capture.view import View
+from splatart_ns.geometry.screw import screw_from_motion
+from splatart_ns.geometry.se3 import from_rotation_translation, inverse, so3_log
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.render_choice import SLIDE_TURN, TURNED_OVER, InitialMotion, alike_in_even_light
+from splatart_ns.stages.symmetric_turns import symmetric_turns
+
+TOUCHING, NO_NEARER = 0.03, 1.5
+"""Parts touch that come as near as this to each other in both states, in the normalised world, or no further than so
+many times as near as any other part: what joins them may not show."""
+NEAR = 0.1
+"""A hinge passes by both parts no further away than this, added up, and shifts none by more."""
+MOST_POINTS = 2000
+"""Points of a part that distances are told by."""
+
+
+def turned_as_neighbours_let(
+    splats: tuple[Splat, Splat],
+    views: tuple[Sequence[View], Sequence[View]],
+    motions: Mapping[int, InitialMotion],
+) -> dict[int, InitialMotion]:
+    """The parts' motions between two states: of a part that turns over against all that it touches, one that looks
+    alike and that a joint with one of these makes.
+
+    Those go first whose motions are not in doubt; from them it spreads to what touches them.
+
+    Args:
+        splats: The labelled splats of the one and the other state.
+        views: Their training views.
+        motions: By part id.
+    """
+    motions = dict(motions)
+    parts = _Parts.of(splats, [p for p, motion in motions.items() if motion.found])
+    T = {p: motions[p].T for p in parts.near}
+    sure = {p for p in parts.near if not motions[p].alike and not parts.turns_over(p, T)}
+    settled = sure | {p for p in parts.near if motions[p].still}
+    waiting = parts.near.keys() - settled
+    while reached := {p: parts.near[p] & settled for p in waiting if parts.near[p] & settled}:
+        for p, others in reached.items():
+            fixed = {q: motions[q].T for q in others}
+            if parts.turns_over(p, fixed | {p: motions[p].T}):
+                motions[p] = _jointed(splats, views, p, motions[p], parts, fixed)
+        settled |= reached.keys()
+        waiting -= reached.keys()
+    return motions
+
+
+def _jointed(
+    splats: tuple[Splat, Splat],
+    views: tuple[Sequence[View], Sequence[View]],
+    part: int,
+    motion: InitialMotion,
+    parts: _Parts,
+    fixed: Mapping[int, Tensor],
+) -> InitialMotion:
+    """Of a part's motion and those that look alike the first that a joint with a part in `fixed`, which moves by that
+    [4, 4], makes; the motion itself if none."""
+
+    def jointed(T: Tensor) -> bool:
+        return any(parts.may_be_jointed(part, q, inverse(T_q) @ T) for q, T_q in fixed.items())
+
+    splat = splats[0].select(splats[0].part_ids == part)
+    R, centroid = symmetric_turns(splat), parts.points[part].mean(0)
+    turned = motion.T @ from_rotation_translation(R, centroid - R @ centroid)
+    turned = turned[[jointed(T) for T in turned]]
+    choices = [motion.T, *motion.alike, *alike_in_even_light(splats, views, part, motion.T, turned)]
+    best = next((i for i, T in enumerate(choices) if jointed(T)), 0)
+    return replace(motion, T=choices[best], alike=tuple(T for i, T in enumerate(choices) if i != best))
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Where parts are in the first of two states, and which of them touch in both."""
+
+    points: Mapping[int, Tensor]
+    """[N, 3] float64 of each."""
+    near: Mapping[int, set[int]]
+    """Which others touch each."""
+
+    @classmethod
+    def of(cls, splats: tuple[Splat, Splat], parts: Sequence[int]) -> _Parts:
+        points = [{p: _points(splat, p) for p in parts} for splat in splats]
+        trees = [{p: cKDTree(x.numpy()) for p, x in of_state.items()} for of_state in points]
+        gaps = {(p, q): max(_gap(tree[p], tree[q]) for tree in trees) for i, p in enumerate(parts) for q in parts[:i]}
+        gaps |= {(q, p): gap for (p, q), gap in gaps.items()}
+        least = {p: min((gaps[p, q] for q in parts if q != p), default=math.inf) for p in parts}
+        near: dict[int, set[int]] = {p: set() for p in parts}
+        for (p, q), gap in gaps.items():
+            if gap < max(TOUCHING, NO_NEARER * least[p]):
+                near[p].add(q)
+                near[q].add(p)
+        return cls(points[0], near)
+
+    def turns_over(self, part: int, motions: Mapping[int, Tensor]) -> bool:
+        """Whether a part turns over against all that it touches of the parts whose motions [4, 4] are given."""
+        turns = [_turn(inverse(motions[q]) @ motions[part]) for q in self.near[part] & motions.keys()]
+        return bool(turns) and min(turns) > TURNED_OVER
+
+    def may_be_jointed(self, a: int, b: int, T: Tensor) -> bool:
+        """Whether T [4, 4], by which part a moves against part b, slides it or turns it about a hinge of both, but not
+        over."""
+        turn = _turn(T)
+        if turn < math.radians(SLIDE_TURN):
+            return True
+        screw = screw_from_motion(T, self.points[a].mean(0))
+        apart = sum(_nearest(self.points[p], screw.point, screw.axis) for p in (a, b))
+        return turn <= TURNED_OVER and apart < NEAR and abs(float(screw.slide)) < NEAR
+
+
+def _turn(T: Tensor) -> float:
+    return float(so3_log(T[:3, :3]).norm())
+
+
+def _nearest(points: Tensor, origin: Tensor, axis: Tensor) -> float:
+    """1st percentile of the distances of points [N, 3] from a line."""
+    across = torch.linalg.cross(points - origin, axis.expand_as(points))
+    return float(across.norm(dim=-1).quantile(0.01))
+
+
+def _gap(a: cKDTree, b: cKDTree) -> float:
+    """1st percentile of the distances of the smaller one's points from the other."""
+    few, many = sorted((a, b), key=lambda tree: tree.n)
+    return float(np.quantile(many.query(few.data)[0], 0.01)) if few.n else math.inf
+
+
+def _points(splat: Splat, part: int) -> Tensor:
+    means = splat.means[splat.part_ids == part].detach().double().cpu()
+    return means[:: max(1, -(-len(means) // MOST_POINTS))]

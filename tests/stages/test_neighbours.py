@@ -1,0 +1,84 @@
+import pytest
+import torch
+from part_scene import angle_deg, box, motion, photograph, two_states
+
+from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.neighbours import turned_as_neighbours_let
+from splatart_ns.stages.render_choice import InitialMotion
+
+EYE = torch.eye(4, dtype=torch.float64)
+RESTS = InitialMotion(EYE, found=True, still=True)
+CENTRE = torch.tensor([0.1, 0.0, -0.09], dtype=torch.float64)
+"""Of the knob."""
+BASE, KNOB = (1, (0.9, 0.6, 0.3), (0.0, 0.0, -0.3)), (2, (0.3, 0.2, 0.12), tuple(CENTRE.tolist()))
+
+
+def about(T, centre):
+    """T as it turns about this point."""
+    T = T.clone()
+    T[:3, 3] += centre - T[:3, :3] @ centre
+    return T
+
+
+def over(T):
+    """The knob upside down where T brings it."""
+    return T @ about(motion((180, 0, 0), (0, 0, 0)), CENTRE)
+
+
+@pytest.fixture(scope="module")
+def knob():
+    """A grey knob on a grey base that turns about itself, and by what."""
+    T = about(motion((0, 0, 25), (0, 0, 0)), CENTRE)
+    base, knob = (box(part, size, centre, 0.04) for part, size, centre in (BASE, KNOB))
+    base.sh, knob.sh = (torch.zeros_like(splat.sh) for splat in (base, knob))
+    splats = Splat.cat([base, knob]), Splat.cat([base, knob.transformed(T)])
+    return splats, tuple(photograph(s) for s in splats), T
+
+
+def test_of_motions_that_look_alike_a_part_makes_the_one_that_does_not_turn_it_over(knob):
+    *scene, T = knob
+    found = turned_as_neighbours_let(*scene, {1: RESTS, 2: InitialMotion(over(T), found=True, alike=(T,))})
+    assert torch.equal(found[2].T, T) and torch.equal(found[2].alike[0], over(T))
+    assert found[1] is RESTS
+
+
+def test_a_motion_that_registration_missed_is_found_by_how_the_part_is_symmetric(knob):
+    *scene, T = knob
+    found = turned_as_neighbours_let(*scene, {1: RESTS, 2: InitialMotion(over(T), found=True)})[2]
+    assert angle_deg(found.T, T) < 1 and (found.T - T)[:3, 3].norm() < 0.01
+    assert len(found.alike) == 1 and torch.equal(found.alike[0], over(T))
+
+
+def test_a_part_that_looks_otherwise_is_left_turned_over():
+    T = motion((0, 0, 120), (0.1, 0.0, 0.0))  # so it did turn: its faces and their halves are of other colours
+    found = turned_as_neighbours_let(*two_states(T), {1: RESTS, 2: InitialMotion(T, found=True)})
+    assert torch.equal(found[2].T, T) and found[2].alike == ()
+
+
+def test_no_motion_is_taken_that_neither_slides_nor_turns_about_a_hinge_of_both(knob):
+    *scene, T = knob
+    screw = about(motion((0, 0, 25), (0, 0, 0.5)), CENTRE)
+    motions = {1: RESTS, 2: InitialMotion(over(T), found=True, alike=(screw,))}
+    found = turned_as_neighbours_let(scene[0], ([], []), motions)  # without views nothing else is found
+    assert torch.equal(found[2].T, over(T))
+
+
+def test_a_part_is_judged_against_what_it_touches_and_that_first():
+    """A link that turns by 160 degrees hangs on one that turns by 80; both are in doubt."""
+    root, arm, hand = (box(part, (0.5, 0.2, 0.2), (0.5 * part, 0.0, 0.0), num_parts=3) for part in (1, 2, 3))
+
+    def turn(degrees, x):
+        return about(motion((0, 0, degrees), (0, 0, 0)), torch.tensor([x, 0.1, 0.0]).double())
+
+    first = turn(80, 0.75)
+    second = first @ turn(80, 1.25)
+    states = Splat.cat([root, arm, hand]), Splat.cat([root, arm.transformed(first), hand.transformed(second)])
+    motions = {
+        3: InitialMotion(second, found=True, alike=(second @ turn(150, 1.25),)),
+        2: InitialMotion(turn(140, 0.75), found=True, alike=(first,)),
+        1: RESTS,
+    }
+    found = turned_as_neighbours_let(states, ([], []), motions)
+    assert torch.equal(found[2].T, first) and found[3] is motions[3]
+    alone = {2: motions[2], 3: InitialMotion(second, found=False)}
+    assert turned_as_neighbours_let(states, ([], []), alone) == alone
