@@ -36,10 +36,11 @@ def turned_as_neighbours_let(
     views: tuple[Sequence[View], Sequence[View]],
     motions: Mapping[int, InitialMotion],
 ) -> dict[int, InitialMotion]:
-    """The parts' motions between two states: of a part that turns over against all that it touches, one that looks
-    alike and that a joint with one of these makes.
+    """The parts' motions between two states: of a part that moves as no joint with what it touches does, one that looks
+    alike and that a joint makes.
 
-    Those go first whose motions are not in doubt; from them it spreads to what touches them.
+    Of what turns over against all that it touches, more motions are sought that look alike in even light. Those parts
+    go first whose motions are not in doubt; from them it spreads to what touches them.
 
     Args:
         splats: The labelled splats of the one and the other state.
@@ -54,9 +55,7 @@ def turned_as_neighbours_let(
     waiting = parts.near.keys() - settled
     while reached := {p: parts.near[p] & settled for p in waiting if parts.near[p] & settled}:
         for p, others in reached.items():
-            fixed = {q: motions[q].T for q in others}
-            if parts.turns_over(p, fixed | {p: motions[p].T}):
-                motions[p] = _jointed(splats, views, p, motions[p], parts, fixed)
+            motions[p] = _jointed(splats, views, p, motions[p], parts, {q: motions[q].T for q in others})
         settled |= reached.keys()
         waiting -= reached.keys()
     return motions
@@ -76,11 +75,12 @@ def _jointed(
     def jointed(T: Tensor) -> bool:
         return any(parts.may_be_jointed(part, q, inverse(T_q) @ T) for q, T_q in fixed.items())
 
-    splat = splats[0].select(splats[0].part_ids == part)
-    R, centroid = symmetric_turns(splat), parts.points[part].mean(0)
-    turned = motion.T @ from_rotation_translation(R, centroid - R @ centroid)
-    turned = turned[[jointed(T) for T in turned]]
-    choices = [motion.T, *motion.alike, *alike_in_even_light(splats, views, part, motion.T, turned)]
+    choices = [motion.T, *motion.alike]
+    if parts.turns_over(part, {**fixed, part: motion.T}):
+        R, centroid = symmetric_turns(splats[0].select(splats[0].part_ids == part)), parts.points[part].mean(0)
+        turned = motion.T @ from_rotation_translation(R, centroid - R @ centroid)
+        turned = turned[[jointed(T) for T in turned]]
+        choices += alike_in_even_light(splats, views, part, motion.T, turned)
     best = next((i for i, T in enumerate(choices) if jointed(T)), 0)
     return replace(motion, T=choices[best], alike=tuple(T for i, T in enumerate(choices) if i != best))
 

@@ -55,6 +55,18 @@ def test_a_part_that_looks_otherwise_is_left_turned_over():
     assert torch.equal(found[2].T, T) and found[2].alike == ()
 
 
+def test_a_door_opens_about_its_hinge_where_it_looks_alike_turned_about_its_middle():
+    post, door = box(1, (0.2, 1.0, 0.2), (-0.6, 0.0, 0.0)), box(2, (1.0, 1.0, 0.06), (0.0, 0.0, 0.0))
+    T = about(motion((0, 30, 0), (0, 0, 0)), torch.tensor([-0.5, 0.0, 0.0]).double())
+    other = T @ motion((0, 0, 70), (0, 0, 0))  # turns by 75 degrees in all
+    states = Splat.cat([post, door]), Splat.cat([post, door.transformed(T)])
+    for motions in ((other, T), (T, other)):
+        found = turned_as_neighbours_let(
+            states, ([], []), {1: RESTS, 2: InitialMotion(motions[0], found=True, alike=motions[1:])}
+        )[2]
+        assert torch.equal(found.T, T) and torch.equal(found.alike[0], other)
+
+
 def test_no_motion_is_taken_that_neither_slides_nor_turns_about_a_hinge_of_both(knob):
     *scene, T = knob
     screw = about(motion((0, 0, 25), (0, 0, 0.5)), CENTRE)
@@ -79,6 +91,6 @@ def test_a_part_is_judged_against_what_it_touches_and_that_first():
         1: RESTS,
     }
     found = turned_as_neighbours_let(states, ([], []), motions)
-    assert torch.equal(found[2].T, first) and found[3] is motions[3]
+    assert torch.equal(found[2].T, first) and torch.equal(found[3].T, second)
     alone = {2: motions[2], 3: InitialMotion(second, found=False)}
     assert turned_as_neighbours_let(states, ([], []), alone) == alone
