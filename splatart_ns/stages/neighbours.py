@@ -51,11 +51,13 @@ def turned_as_neighbours_let(
     parts = _Parts.of(splats, [p for p, motion in motions.items() if motion.found])
     T = {p: motions[p].T for p in parts.near}
     sure = {p for p in parts.near if not motions[p].alike and not parts.turns_over(p, T)}
-    settled = sure | {p for p in parts.near if motions[p].still}
+    rest = {p: T[p] for p in parts.near if motions[p].still}
+    settled = sure | rest.keys()
     waiting = parts.near.keys() - settled
     while reached := {p: parts.near[p] & settled for p in waiting if parts.near[p] & settled}:
         for p, others in reached.items():
-            motions[p] = _jointed(splats, views, p, motions[p], parts, {q: motions[q].T for q in others})
+            fixed = {q: motions[q].T for q in others}
+            motions[p] = _jointed(splats, views, p, motions[p], parts, fixed, rest)
         settled |= reached.keys()
         waiting -= reached.keys()
     return motions
@@ -68,12 +70,13 @@ def _jointed(
     motion: InitialMotion,
     parts: _Parts,
     fixed: Mapping[int, Tensor],
+    rest: Mapping[int, Tensor],
 ) -> InitialMotion:
-    """Of a part's motion and those that look alike the first that a joint with a part in `fixed`, which moves by that
-    [4, 4], makes; the motion itself if none."""
+    """Of a part's motion and those that look alike the first that a joint with a part makes that touches it, or rests:
+    its front may touch other drawers alone. The motion itself if none does; `fixed` and `rest` are motions [4, 4]."""
 
     def jointed(T: Tensor) -> bool:
-        return any(parts.may_be_jointed(part, q, inverse(T_q) @ T) for q, T_q in fixed.items())
+        return any(parts.may_be_jointed(part, q, inverse(T_q) @ T) for q, T_q in {**rest, **fixed}.items())
 
     choices = [motion.T, *motion.alike]
     if parts.turns_over(part, {**fixed, part: motion.T}):

@@ -41,6 +41,8 @@ LOST = math.radians(2 * DIP)
 SLID = 5.0
 """Standard deviations by which a part that seems to rest must have slid: parts that rest measured up to 2.3, round ones
 that turned up to 3.5, most buttons that were pressed by half a pixel to two 5 to 20."""
+LEAST_SLIDE = 0.1
+"""Nor is it less than this share of a pixel: how light falls on a part otherwise moves it by 0.01."""
 MAYBE_SLIDING = math.radians(10)
 """A part that turned less than this against another may be sliding: thin parts' turns are known no better."""
 
@@ -132,7 +134,16 @@ def _slid_a_little(pair: PartPair, stays: Refinement, central: bool) -> Refineme
     slide = shifted(pair, T, T[:3, :3], central)
     moved = transform_points(slide.T, pair.centroid[None])[0] - transform_points(T, pair.centroid[None])[0]
     surely = _deviations(moved, motion_covariance(pair, slide.T, slide.equations)) >= SLID
-    return slide if surely else None
+    return slide if surely and moved.norm() >= LEAST_SLIDE * _pixel(pair) else None
+
+
+def _pixel(pair: PartPair) -> float:
+    """How long what a pixel shows of the part in the source state is: the median over the views."""
+    x = pair.centroid[None]
+    sizes = [
+        transform_points(v.viewmat.to(x), x)[0, 2] / v.K[0, 0] / v.factor for of_state in pair.views for v in of_state
+    ]
+    return float(torch.stack(sizes).median())
 
 
 def _deviations(shift: Tensor, covariance: Tensor) -> float:

@@ -17,7 +17,7 @@ from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import so3_log, transform_points
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import part_pair
-from splatart_ns.stages.refinement import refine
+from splatart_ns.stages.refinement import shifted
 from splatart_ns.stages.render_choice import (
     ALIKE,
     COARSE_PIXELS,
@@ -75,13 +75,11 @@ def slid_alike(
     slides[..., :3, 3] = far[:, None] * ways[:, None].to(motion.T)
     starts = [along[int(appearance_cost(coarse, along).argmin())] for along in slides]
     known = [motion.T, *motion.alike]
-    found = [refine(fine, start, 10) for start in starts]
+    found = [shifted(fine, start) for start in starts]
     ends = torch.stack([*known, *(end.T for end in found)])
     cost = appearance_cost(fine, ends)
-    turn = so3_log(ends[:, :3, :3]).norm(dim=-1)
     shift = (transform_points(ends, fine.centroid[None])[:, 0] - fine.centroid).norm(dim=-1)
-    slides = (turn < math.radians(SLIDE_TURN)) & (shift > MOVED * fine.radius)
-    good = [i for i in range(len(known), len(ends)) if slides[i] and cost[i] < ALIKE * cost[0]]
+    good = [i for i in range(len(known), len(ends)) if shift[i] > MOVED * fine.radius and cost[i] < ALIKE * cost[0]]
     if not good:
         return motion
     best = min(good, key=lambda i: cost[i])

@@ -5,6 +5,7 @@ from part_scene import box, photograph
 
 from splatart_ns.geometry.se3 import se3_exp
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages import hull
 from splatart_ns.stages.hull import (
     MIN_POINTS_PER_PART,
     POINTS_PER_PART,
@@ -23,8 +24,8 @@ BASE, KNOB = box(1, SIZE, (0.0, 0.0, -0.1)), box(2, (0.16, 0.16, 0.16), (0.0, 0.
 VIEWS = photograph(Splat.cat([BASE, KNOB]), count=14)
 
 
-def started(views, count, hull, seed: int = 0):
-    return seed_points(views, 2, count, torch.Generator().manual_seed(seed), hull, seen_surface(views, *hull))
+def started(views, count, voxels, seed: int = 0):
+    return seed_points(views, 2, count, torch.Generator().manual_seed(seed), voxels, seen_surface(views, *voxels))
 
 
 def seeds(seed: int = 0):
@@ -62,28 +63,39 @@ def test_beyond_the_border_of_a_whole_view_is_outside_and_of_a_cut_view_unknown(
 
 def test_points_take_the_label_that_most_views_show():
     points = torch.tensor([[0.0, 0.0, 0.3], [0.4, 0.25, -0.2]])
-    assert likely_parts(VIEWS, points, 0.05, 2).tolist() == [2, 1]
+    labels, share = likely_parts(VIEWS, points, 0.05, 2)
+    assert labels.tolist() == [2, 1]
+    assert share[1] == 1.0 and 0.5 < share[0] < 1.0  # from below the base is before the knob
     silent = [replace(view, labels=None) for view in VIEWS]
-    assert likely_parts(silent, points, 0.05, 2).tolist() == [0, 0]
+    labels, share = likely_parts(silent, points, 0.05, 2)
+    assert labels.tolist() == share.tolist() == [0, 0]
 
 
 def test_a_small_part_gets_its_least_number_of_points():
-    labels = likely_parts(VIEWS, seeds().xyz, 0.03, 2)  # of 500 points, 250 each: it has a fortieth of the volume
+    labels, _ = likely_parts(VIEWS, seeds().xyz, 0.03, 2)  # of 500 points, 250 each: it has a fortieth of the volume
     assert (labels == 2).sum() > 0.8 * 250
     fine = photograph(Splat.cat([BASE, KNOB]), count=6, pixels=240)
     points = started(fine, 4000, visual_hull(fine, resolution=40))
-    labels = likely_parts(fine, points.xyz, 0.03, 2)
+    labels, _ = likely_parts(fine, points.xyz, 0.03, 2)
     assert 0.8 * MIN_POINTS_PER_PART[2] < (labels == 2).sum() < 1.5 * MIN_POINTS_PER_PART[2]
 
 
 def test_a_small_part_that_half_of_the_views_see_nothing_of_gets_points_by_its_pixels():
     button = box(2, (0.12, 0.12, 0.04), (0.1, 0.0, 0.07), spacing=0.02)
     views = photograph(Splat.cat([BASE, button]), count=14, pixels=160)
-    hull = visual_hull(views)
-    points = started(views, 4000, hull)
+    points = started(views, 4000, visual_hull(views))
     above = ((points.xyz[:, :2] - torch.tensor([0.1, 0.0])).abs() < 0.1).all(-1) & (points.xyz[:, 2] > 0.06)
     most = max(int((view.labels == 2).sum()) for view in views)
     assert 4 * most < above.sum() < 8 * most
+
+
+def test_a_small_part_gets_its_points_where_the_views_agree(monkeypatch):
+    def left_is_more_sure(views, points, size, num_parts):
+        return torch.where(points[:, 2] > 0.2, 2, 1), torch.where(points[:, 0] < 0, 0.9, 0.3)
+
+    monkeypatch.setattr(hull, "likely_parts", left_is_more_sure)
+    knob = (xyz := seeds().xyz)[xyz[:, 2] > 0.2]
+    assert (knob[:, 0] < 0.02).float().mean() > 0.9
 
 
 def test_the_outermost_voxels_lack_a_neighbour():

@@ -75,6 +75,19 @@ def test_no_motion_is_taken_that_neither_slides_nor_turns_about_a_hinge_of_both(
     assert torch.equal(found[2].T, over(T))
 
 
+def test_what_slides_past_all_that_rests_need_not_move_as_what_it_touches():
+    body = box(1, (0.5, 0.5, 0.5), (0.0, 1.0, 0.0), num_parts=3)
+    other, drawer = (box(part, (0.3, 0.1, 0.3), (0.3 * part, 0.0, 0.0), num_parts=3) for part in (2, 3))
+    turned, slide = motion((0, 0, 80), (0.1, 0.0, 0.0)), motion((0, 0, 0), (0.0, -0.3, 0.0))
+    states = Splat.cat([body, other, drawer]), Splat.cat([body, other, drawer.transformed(slide)])
+    motions = {
+        1: RESTS,
+        2: InitialMotion(turned, found=True),
+        3: InitialMotion(slide, found=True, alike=(turned @ motion((0, 0, 5), (0, 0, 0)),)),
+    }
+    assert torch.equal(turned_as_neighbours_let(states, ([], []), motions)[3].T, slide)
+
+
 def test_a_part_is_judged_against_what_it_touches_and_that_first():
     """A link that turns by 160 degrees hangs on one that turns by 80; both are in doubt."""
     root, arm, hand = (box(part, (0.5, 0.2, 0.2), (0.5 * part, 0.0, 0.0), num_parts=3) for part in (1, 2, 3))
