@@ -13,6 +13,7 @@ the group, so that the joints within it are not lost.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
@@ -47,9 +48,10 @@ hinge whose axis its parent and the child itself turn about on the root, as door
 that the other two do not, and a drawer shows where it nears its neighbour but not where it touches the body. And that
 of a part that is nearly fixed to such a one, but not quite: both moved by about as much. And that of a slide between
 two parts that turn about parallel lines on the root: from one state to another by the same angle."""
-_NOT_QUITE = 0.004
+_NOT_QUITE, _OF_MOTION = 0.004, 0.15
 """Least residual of such a fixed joint, as a share of the object's radius: a handle's on its door is as small as the
-errors of poses are."""
+errors of poses are. Or as a share of what a fixed joint to the root leaves, if that is less: of two buttons that moved
+by 0.011 and 0.013 radii it is a fifth."""
 _PARALLEL = 0.98
 """Least cosine of the angle between slides along one way, and hinges about one line."""
 _ONE_LINE = 0.1
@@ -250,7 +252,9 @@ def _stacked(
     if any(fit is None or not fit.accepted for fit in fits):
         return _STACKED
     between, *on_root = fits
-    not_quite_fixed = between.type == "fixed" and between.residual > _NOT_QUITE * object_radius
+    moved = min((a["residual"] for a in on_root[1].alternatives if a["type"] == "fixed"), default=math.inf)
+    not_quite = min(_NOT_QUITE * object_radius, _OF_MOTION * moved)
+    not_quite_fixed = between.type == "fixed" and between.residual > not_quite
     by_one_angle = between.type == "prismatic" and {fit.type for fit in on_root} == {"revolute"}
     if not_quite_fixed or by_one_angle:
         fits = on_root

@@ -467,13 +467,18 @@ def test_between_nearly_equal_parents_the_root_wins(kind, apart, closer, parent)
 
 
 @pytest.mark.parametrize("kind", ["prismatic", "revolute"])
-@pytest.mark.parametrize("residual, parent", [(0.006, 1), (0.002, 2)], ids=["nearly fixed", "fixed"])
-def test_of_two_that_moved_nearly_alike_none_hangs_on_the_other_but_a_handle_does(kind, residual, parent):
+@pytest.mark.parametrize(
+    "residual, travel, parent",
+    [(0.006, 0.2, 1), (0.002, 0.2, 2), (0.002, 0.01, 1), (0.001, 0.01, 2)],
+    ids=["nearly fixed", "fixed", "two buttons", "fixed on a button"],
+)
+def test_of_two_that_moved_nearly_alike_none_hangs_on_the_other_but_a_handle_does(kind, residual, travel, parent):
     def move(value):
-        return JointFit(kind, X, 0 * X, 0.0, torch.tensor([0.0, value]).double(), residual=0.0)
+        held = [{"type": "fixed", "residual": value, "score": 1.0}]
+        return JointFit(kind, X, 0 * X, 0.0, torch.tensor([0.0, value]).double(), residual=0.0, alternatives=held)
 
     fixed = JointFit("fixed", 0 * X, 0 * X, 0.0, torch.zeros(2).double(), residual=residual)
-    joints = {(1, 2): move(0.2), (1, 3): move(0.21), (2, 3): fixed}
+    joints = {(1, 2): move(travel), (1, 3): move(1.05 * travel), (2, 3): fixed}
     joints |= {(b, a): fit for (a, b), fit in joints.items()}
     on_axis = torch.zeros(2, 3).double()
     gaps = {(1, 2): 0.02, (1, 3): 0.09, (2, 3): 0.03}
