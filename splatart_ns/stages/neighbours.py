@@ -100,7 +100,7 @@ class _Parts:
     @classmethod
     def of(cls, splats: tuple[Splat, Splat], parts: Sequence[int]) -> _Parts:
         points = [{p: _points(splat, p) for p in parts} for splat in splats]
-        trees = [{p: cKDTree(x.numpy()) for p, x in of_state.items()} for of_state in points]
+        trees = [{p: cKDTree(x.numpy(force=True)) for p, x in of_state.items()} for of_state in points]
         gaps = {(p, q): max(_gap(tree[p], tree[q]) for tree in trees) for i, p in enumerate(parts) for q in parts[:i]}
         gaps |= {(q, p): gap for (p, q), gap in gaps.items()}
         least = {p: min((gaps[p, q] for q in parts if q != p), default=math.inf) for p in parts}
@@ -144,5 +144,5 @@ def _gap(a: cKDTree, b: cKDTree) -> float:
 
 
 def _points(splat: Splat, part: int) -> Tensor:
-    means = splat.means[splat.part_ids == part].detach().double().cpu()
+    means = splat.means[splat.part_ids == part].detach().double()
     return means[:: max(1, -(-len(means) // MOST_POINTS))]
