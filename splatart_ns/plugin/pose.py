@@ -209,11 +209,11 @@ class PosePipeline(VanillaPipeline):
             for s in range(S):
                 if s != first:
                     pair = [(everything[first], everything[s]) for everything in (splats, self.views, self._seen)]
-                    found.setdefault((first, s), {})[p] = initial_motion(*pair, p + 1, self.config.seed)
+                    found.setdefault((first, s), {})[p + 1] = initial_motion(*pair, p + 1, self.config.seed)
         for (first, s), motions in found.items():
             ways = slide_ways(list(motions.values()))
             pair = [(everything[first], everything[s]) for everything in (splats, self.views)]
-            slid = {p + 1: slid_alike(*pair, p + 1, m, ways) if m.alike else m for p, m in motions.items()}
+            slid = {part: slid_alike(*pair, part, m, ways) if m.alike else m for part, m in motions.items()}
             for part, motion in turned_as_neighbours_let(*pair, slid).items():
                 p = part - 1
                 M[s, p] = motion.T.cpu()

@@ -10,15 +10,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.screw import screw_from_motion
 from splatart_ns.geometry.se3 import from_rotation_translation, inverse, so3_log
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.contact import Contact, find_contacts
 from splatart_ns.stages.render_choice import SLIDE_TURN, TURNED_OVER, InitialMotion, alike_in_even_light
 from splatart_ns.stages.symmetric_turns import symmetric_turns
 
@@ -27,8 +26,6 @@ TOUCHING, NO_NEARER = 0.03, 1.5
 many times as near as any other part: what joins them may not show."""
 NEAR = 0.1
 """A hinge passes by both parts no further away than this, added up, and shifts none by more."""
-MOST_POINTS = 2000
-"""Points of a part that distances are told by."""
 
 
 def turned_as_neighbours_let(
@@ -80,7 +77,8 @@ def _jointed(
 
     choices = [motion.T, *motion.alike]
     if parts.turns_over(part, {**fixed, part: motion.T}):
-        R, centroid = symmetric_turns(splats[0].select(splats[0].part_ids == part)), parts.points[part].mean(0)
+        splat = splats[0].select(splats[0].part_ids == part)
+        R, centroid = symmetric_turns(splat), splat.means.double().mean(0)
         turned = motion.T @ from_rotation_translation(R, centroid - R @ centroid)
         turned = turned[[jointed(T) for T in turned]]
         choices += alike_in_even_light(splats, views, part, motion.T, turned)
@@ -92,24 +90,24 @@ def _jointed(
 class _Parts:
     """Where parts are in the first of two states, and which of them touch in both."""
 
-    points: Mapping[int, Tensor]
-    """[N, 3] float64 of each."""
+    contacts: Mapping[tuple[int, int], Contact]
+    """Of each pair of parts, the smaller id first, in the first state."""
     near: Mapping[int, set[int]]
     """Which others touch each."""
 
     @classmethod
     def of(cls, splats: tuple[Splat, Splat], parts: Sequence[int]) -> _Parts:
-        points = [{p: _points(splat, p) for p in parts} for splat in splats]
-        trees = [{p: cKDTree(x.numpy(force=True)) for p, x in of_state.items()} for of_state in points]
-        gaps = {(p, q): max(_gap(tree[p], tree[q]) for tree in trees) for i, p in enumerate(parts) for q in parts[:i]}
-        gaps |= {(q, p): gap for (p, q), gap in gaps.items()}
-        least = {p: min((gaps[p, q] for q in parts if q != p), default=math.inf) for p in parts}
+        # Motions are in doubt, so each state's own Gaussians tell how close parts come in it.
+        rest = {p: torch.eye(4).to(splats[0].means)[None] for p in parts}
+        of_states = [find_contacts({p: splat.means[splat.part_ids == p] for p in parts}, rest) for splat in splats]
+        gaps = {pair: max(contacts[pair].gap for contacts in of_states) for pair in of_states[0]}
+        least = {p: min((gap for pair, gap in gaps.items() if p in pair), default=math.inf) for p in parts}
         near: dict[int, set[int]] = {p: set() for p in parts}
         for (p, q), gap in gaps.items():
-            if gap < max(TOUCHING, NO_NEARER * least[p]):
+            if gap < max(TOUCHING, NO_NEARER * least[p], NO_NEARER * least[q]):
                 near[p].add(q)
                 near[q].add(p)
-        return cls(points[0], near)
+        return cls(of_states[0], near)
 
     def turns_over(self, part: int, motions: Mapping[int, Tensor]) -> bool:
         """Whether a part turns over against all that it touches of the parts whose motions [4, 4] are given."""
@@ -122,27 +120,11 @@ class _Parts:
         turn = _turn(T)
         if turn < math.radians(SLIDE_TURN):
             return True
-        screw = screw_from_motion(T, self.points[a].mean(0))
-        apart = sum(_nearest(self.points[p], screw.point, screw.axis) for p in (a, b))
+        contact = self.contacts[min(a, b), max(a, b)]
+        screw = screw_from_motion(T, contact.points.mean(0))
+        apart = contact.distance_to_axis(screw.axis, screw.point)
         return turn <= TURNED_OVER and apart < NEAR and abs(float(screw.slide)) < NEAR
 
 
 def _turn(T: Tensor) -> float:
     return float(so3_log(T[:3, :3]).norm())
-
-
-def _nearest(points: Tensor, origin: Tensor, axis: Tensor) -> float:
-    """1st percentile of the distances of points [N, 3] from a line."""
-    across = torch.linalg.cross(points - origin, axis.expand_as(points))
-    return float(across.norm(dim=-1).quantile(0.01))
-
-
-def _gap(a: cKDTree, b: cKDTree) -> float:
-    """1st percentile of the distances of the smaller one's points from the other."""
-    few, many = sorted((a, b), key=lambda tree: tree.n)
-    return float(np.quantile(many.query(few.data)[0], 0.01)) if few.n else math.inf
-
-
-def _points(splat: Splat, part: int) -> Tensor:
-    means = splat.means[splat.part_ids == part].detach().double()
-    return means[:: max(1, -(-len(means) // MOST_POINTS))]

@@ -107,6 +107,16 @@ def test_a_part_in_doubt_is_sought_along_the_ways_of_sure_slides(pose_trainer, m
     assert not any(model.alike)
 
 
+def test_parts_move_as_what_they_touch_lets_them(pose_trainer, monkeypatch):
+    found, better = (InitialMotion(torch.eye(4).double(), found=True) for _ in range(2))
+    better.T[2, 3] = 0.2
+    monkeypatch.setattr("splatart_ns.plugin.pose.initial_motion", lambda *_: found)
+    monkeypatch.setattr(
+        "splatart_ns.plugin.pose.turned_as_neighbours_let", lambda splats, views, motions: {**motions, 2: better}
+    )
+    assert torch.equal(pose_trainer().pipeline.model.poses.T()[1], torch.stack([found.T, better.T]))
+
+
 @pytest.mark.parametrize("worlds", ["shared", "rigid"])
 def test_only_in_one_world_is_what_looks_still_held_still(pose_trainer, monkeypatch, worlds):
     still = InitialMotion(torch.eye(4).double(), found=True, still=True)
