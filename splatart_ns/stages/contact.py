@@ -30,17 +30,20 @@ class Contact:
     parts: tuple[Tensor, Tensor]
     """Points [N, 3] of both parts, where these are at state 0."""
 
-    def distance_to_axis(self, axis: Tensor, origin: Tensor) -> float:
+    def distance_to_axis(self, axis: Tensor, origin: Tensor, through_holes: bool = True) -> float:
         """How far the line through `origin` [3] along the unit vector `axis` [3] passes by the two parts, added up.
 
         By a part that lies all around it, with a hole there for the other part, it does not: no image shows what is
         behind a knob. The distance of their contact would not do: what two knobs have nearest to each other lies on a
-        wrong axis between them as near as the rim of a knob, behind which the panel is hidden, to the right one.
+        wrong axis between them as near as the rim of a knob, behind which the panel is hidden, to the right one. Unless
+        axes may not pass `through_holes`, as that of a pane turned about its middle does through its frame.
         """
         across = [torch.linalg.cross(points - origin, axis.expand_as(points)) for points in self.parts]
         nearest, farthest = zip(*(_extent(torch.linalg.vector_norm(x, dim=-1)) for x in across), strict=True)
         # A hole less than half as wide as the other part is not for it, and may be the distance of the samples.
-        holes = [2 * nearest[k] > farthest[1 - k] and _all_around(x, axis) for k, x in enumerate(across)]
+        holes = [
+            through_holes and 2 * nearest[k] > farthest[1 - k] and _all_around(x, axis) for k, x in enumerate(across)
+        ]
         return sum(0.0 if hole else distance for hole, distance in zip(holes, nearest, strict=True))
 
     def distance_to_point(self, point: Tensor) -> float:

@@ -122,7 +122,7 @@ class _Parts:
             return True
         contact = self.contacts[min(a, b), max(a, b)]
         screw = screw_from_motion(T, contact.points.mean(0))
-        apart = contact.distance_to_axis(screw.axis, screw.point)
+        apart = contact.distance_to_axis(screw.axis, screw.point, through_holes=False)
         return turn <= TURNED_OVER and apart < NEAR and abs(float(screw.slide)) < NEAR
 
 

@@ -67,6 +67,18 @@ def test_a_door_opens_about_its_hinge_where_it_looks_alike_turned_about_its_midd
         assert torch.equal(found.T, T) and torch.equal(found.alike[0], other)
 
 
+def test_a_pane_opens_about_its_hinge_where_it_looks_alike_turned_about_the_middle_of_its_frame():
+    sides = [((0.1, 1.2, 0.1), (x, 0.0, 0.0)) for x in (-0.6, 0.6)] + [
+        ((1.2, 0.1, 0.1), (0.0, y, 0.0)) for y in (-0.6, 0.6)
+    ]
+    frame = Splat.cat([box(1, *side) for side in sides])
+    pane = box(2, (1.0, 1.0, 0.06), (0.0, 0.0, 0.0))
+    T = about(motion((0, 30, 0), (0, 0, 0)), torch.tensor([-0.5, 0.0, 0.0]).double())
+    states = Splat.cat([frame, pane]), Splat.cat([frame, pane.transformed(T)])
+    motions = {1: RESTS, 2: InitialMotion(motion((0, 0, 70), (0, 0, 0)), found=True, alike=(T,))}
+    assert torch.equal(turned_as_neighbours_let(states, ([], []), motions)[2].T, T)
+
+
 def test_no_motion_is_taken_that_neither_slides_nor_turns_about_a_hinge_of_both(knob):
     *scene, T = knob
     screw = about(motion((0, 0, 25), (0, 0, 0.5)), CENTRE)
