@@ -29,10 +29,11 @@ from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.plugin.semantic_run import find_semantic_runs, read_state
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.flush import is_flush
 from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.neighbours import turned_as_neighbours_let
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
-from splatart_ns.stages.reference import reference_states, refine_known_poses, since_state_0
+from splatart_ns.stages.reference import is_sure, reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import InitialMotion, initial_motion
 from splatart_ns.stages.siblings import slid_alike, slide_ways
 from splatart_ns.stages.thinning import BUDGET, MAX_VIEWS, ROUNDS, absences, expendable
@@ -42,6 +43,12 @@ from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_vie
 
 THINNING_STEPS = 25
 """A round of thinning comes after every so many-th part of the steps on merged Gaussians."""
+BESIDE = 0.5
+"""Poses of parts with more than this share of their border against others learn along with merged Gaussians."""
+RATES = 1e-3, 2e-5
+"""Of these poses, in the first and in the last step; radians and radii of the part."""
+WELL_KNOWN = 0.01
+"""Their largest standard deviation, in radians and radii: others would be led by single views."""
 
 
 @dataclass
@@ -284,7 +291,9 @@ class PosePipeline(VanillaPipeline):
         if model.merged:
             # Beside the piece that shows the object nothing is wrong: the means are those over the whole image.
             state, view, share = next(self._own)
-            shots = [(model.splat_at(state, model.poses.base), view)]  # final: a merger has committed them
+            # Where none learns, no gradient need reach them.
+            T = model.poses.T() if model.poses.free.any() else model.poses.base
+            shots = [(model.splat_at(state, T), view)]
         else:
             shots, share, T = [], 1.0, model.poses.T()
             for _ in range(2):
@@ -332,11 +341,24 @@ class PosePipeline(VanillaPipeline):
             if rest == 0 and 0 <= turn < ROUNDS:
                 self._thin(turn, optimizers)
 
+        def slow_down(step: int) -> None:
+            if self.model.merged:
+                share = (step - self.model.config.pose_steps) / (steps - self.model.config.pose_steps)
+                optimizers.optimizers["part_poses"].param_groups[0]["lr"] = RATES[0] * (RATES[1] / RATES[0]) ** share
+
         def count(step: int) -> None:
             self.model.step = step
 
+        def finish(step: int) -> None:
+            if step == steps - 1:
+                self.model.poses.commit(self.model.poses.T())
+
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-        return [TrainingCallback(before, function) for function in (merge, thin, count)]
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        return [
+            *(TrainingCallback(before, function) for function in (merge, thin, slow_down, count)),
+            TrainingCallback(after, finish),
+        ]
 
     @torch.no_grad()
     def _merge(self, optimizers: Optimizers) -> None:
@@ -355,6 +377,7 @@ class PosePipeline(VanillaPipeline):
             self._clear if as_begun else None,
         )
         model.poses.commit(T)
+        model.poses.release(self._learning_along(splats), model.covariance[..., 3:, 3:].flatten(2).any(-1))
         known = model.covariance.isfinite().flatten(2).all(-1)
         self._note_unknown(known)
         self._note_turned(model.covariance)
@@ -365,9 +388,25 @@ class PosePipeline(VanillaPipeline):
             optimizers.optimizers[name].param_groups[0]["params"] = [parameter]
             optimizers.optimizers[name].state.clear()
             optimizers.schedulers[name].last_epoch = 0  # the merged Gaussians' rates begin to decay
-        optimizers.schedulers.pop("part_poses", None)  # they are final
+        optimizers.schedulers.pop("part_poses", None)
+        optimizers.optimizers["part_poses"].state.clear()
         model.state_ids = torch.zeros(len(merged), dtype=torch.long, device=model.device)
         model.merged = torch.tensor(True, device=model.device)
+
+    def _learning_along(self, splats: list[Splat]) -> Tensor:
+        """Which poses [S, P] learn along with the merged Gaussians.
+
+        Where a part lies against others, as a door does, its edges and what they touch are haze that no view shows;
+        moved, it shows, and shifts the part. Merged Gaussians lose it, for all states say what is there. Of a part that
+        is free all around, like a robot's link, how light falls on it would mislead the pose.
+        """
+        model, T = self.model, self.model.poses.base
+        centroids, radii = part_extents(splats[0], model.num_parts)
+        learning = torch.zeros_like(self._known)
+        for s, p in (self._known & self._known[0] & ~self._frozen).nonzero().tolist():
+            if s > 0 and is_sure(T[s, p], model.covariance[s, p], centroids[p], radii[p], WELL_KNOWN):
+                learning[s, p] = any(is_flush(self.views[t], p + 1, BESIDE) for t in (self._reference[p], s))
+        return learning
 
     @torch.no_grad()
     def _thin(self, turn: int, optimizers: Optimizers) -> None:

@@ -40,8 +40,8 @@ LEAST = 0.1
 """Where less than this share of a part's pixels is left in both states together, all of them count."""
 
 
-def is_flush(views: Sequence[View], part: int) -> bool:
-    """Whether most of a part's border lies against other parts."""
+def is_flush(views: Sequence[View], part: int, share: float = FLUSH) -> bool:
+    """Whether more than a share of a part's border lies against other parts."""
     against = torch.zeros(2)
     for view in best_views(views, part, MAX_VIEWS):
         if view.labels is None:
@@ -50,7 +50,7 @@ def is_flush(views: Sequence[View], part: int) -> bool:
             for inside, beside in ((labels[1:], labels[:-1]), (labels[:-1], labels[1:])):
                 beside = beside[(inside == part) & (beside != part) & (beside != UNLABELLED)]
                 against += torch.stack([(beside == 0).sum(), (beside > 0).sum()]).cpu()
-    return bool(against[1] > FLUSH * against.sum())
+    return bool(against[1] > share * against.sum())
 
 
 def surface_depths(splat: Splat, views: Sequence[View]) -> list[Tensor]:

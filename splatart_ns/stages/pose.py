@@ -42,6 +42,7 @@ class PartPoses(nn.Module):
         self.register_buffer("centroids", centroids.double())
         self.register_buffer("radii", radii.double())
         self.register_buffer("free", free)
+        self.register_buffer("turning", torch.ones_like(free), persistent=False)
         self.rotation = nn.Parameter(torch.zeros(S - 1, P, 3, dtype=torch.float64))
         """Rotation vectors [S - 1, P, 3], radians."""
         self.translation = nn.Parameter(torch.zeros(S - 1, P, 3, dtype=torch.float64))
@@ -50,7 +51,7 @@ class PartPoses(nn.Module):
     def T(self) -> Tensor:
         """Poses [S, P, 4, 4] float64: where a point of part p in state 0 is in state s."""
         free = self.free[..., None]
-        R = so3_exp(self.rotation * free)
+        R = so3_exp(self.rotation * (free & self.turning[..., None]))
         pivot = transform_points(self.base[1:], self.centroids[:, None])[..., 0, :]
         shift = self.translation * free * self.radii[:, None]
         small = from_rotation_translation(R, pivot + shift - (R @ pivot[..., None])[..., 0])
@@ -62,6 +63,11 @@ class PartPoses(nn.Module):
         self.base.copy_(T)
         self.rotation.zero_()
         self.translation.zero_()
+
+    def release(self, free: Tensor, turning: Tensor) -> None:
+        """Let just the poses `free` [S, P] bool change, those not `turning` [S, P] bool by shifts alone."""
+        self.free.copy_(free[1:])
+        self.turning.copy_(turning[1:])
 
 
 def part_extents(splat: Splat, num_parts: int) -> tuple[Tensor, Tensor]:

@@ -86,7 +86,7 @@ def refine_known_poses(
     for p, first in enumerate(reference):
         if first == 0:
             continue
-        if not _sure(M[0, p], covariances[0, p], *(x[p] for x in part_extents(splats[first], P))):
+        if not is_sure(M[0, p], covariances[0, p], *(x[p] for x in part_extents(splats[first], P)), SURE):
             covariances[0, p] = torch.nan
             continue
         # M = exp(d) M_true, so that T = M[s] M[0]^-1 has the errors of both.
@@ -125,8 +125,9 @@ def _of(splat: Splat, parts: Sequence[int]) -> Tensor:
     return torch.isin(splat.part_ids, torch.tensor(parts).to(splat.part_ids) + 1)
 
 
-def _sure(M: Tensor, covariance: Tensor, centroid: Tensor, radius: Tensor) -> bool:
-    """Whether a pose M [4, 4] is certain enough to count others from; `centroid` [3] of the part before it."""
+def is_sure(M: Tensor, covariance: Tensor, centroid: Tensor, radius: Tensor, within: float) -> bool:
+    """Whether no standard deviation of a pose M [4, 4] is larger than `within`, in radians and in radii of the
+    part; `centroid` [3] of the part before it."""
     if not covariance.isfinite().all():
         return False
     shift = torch.cat([torch.eye(3).to(M), -skew(transform_points(M, centroid[None])[0])], dim=1)
@@ -134,4 +135,4 @@ def _sure(M: Tensor, covariance: Tensor, centroid: Tensor, radius: Tensor) -> bo
         torch.linalg.eigvalsh(shift @ covariance @ shift.mT)[-1],
         torch.linalg.eigvalsh(covariance[3:, 3:])[-1],
     )
-    return bool(variances[0] <= (SURE * radius) ** 2) and bool(variances[1] <= SURE**2)
+    return bool(variances[0] <= (within * radius) ** 2) and bool(variances[1] <= within**2)

@@ -160,7 +160,7 @@ def test_gaussians_wait_for_the_poses_or_learn_along(pose_trainer, learn):
 
 def test_merged_gaussians_that_the_images_hardly_miss_go_and_the_report_tells(pose_trainer, monkeypatch):
     def known(splats, views, T, *_):
-        return T, torch.zeros(*T.shape[:2], 6, 6), torch.full((2, 2), torch.nan)
+        return T, torch.zeros(*T.shape[:2], 6, 6, dtype=torch.float64), torch.full((2, 2), torch.nan)
 
     monkeypatch.setattr("splatart_ns.plugin.pose.refine_known_poses", known)
     trainer = pose_trainer(steps=6, pose_steps=0, init="centroids")
@@ -174,6 +174,31 @@ def test_merged_gaussians_that_the_images_hardly_miss_go_and_the_report_tells(po
     for name, parameter in model.gauss_params.items():
         (trained,) = trainer.optimizers.optimizers[name].param_groups[0]["params"]
         assert trained is parameter and len(parameter) == after
+
+
+@pytest.mark.parametrize(
+    ("beside", "deviation", "learns"), [(True, 0.001, True), (False, 0.001, False), (True, 0.1, False)]
+)
+def test_well_known_poses_of_parts_against_others_learn_with_merged_gaussians(
+    pose_trainer, monkeypatch, beside, deviation, learns
+):
+    found = {}
+
+    def known(splats, views, T, *_):
+        found["T"] = T.clone()
+        covariance = torch.eye(6, dtype=torch.float64).repeat(*T.shape[:2], 1, 1) * (0.1 * deviation) ** 2
+        return T, covariance, torch.full((2, 2), torch.nan)
+
+    monkeypatch.setattr("splatart_ns.plugin.pose.refine_known_poses", known)
+    monkeypatch.setattr("splatart_ns.plugin.pose.is_flush", lambda views, part, share: beside and part == 2)
+    trainer = pose_trainer(steps=6, pose_steps=0, init="centroids")
+    trainer.train()
+    poses = trainer.pipeline.model.poses
+    assert torch.equal(poses.base[:, 0], found["T"][:, 0])
+    assert torch.equal(poses.base[1, 1], found["T"][1, 1]) != learns
+    assert not poses.rotation.any() and not poses.translation.any()
+    turned = (poses.base[1, 1] @ found["T"][1, 1].inverse())[:3, :3]
+    assert torch.allclose(turned, torch.eye(3).double(), atol=0.02)
 
 
 def test_what_a_state_does_not_show_is_not_missed_there(pose_trainer):

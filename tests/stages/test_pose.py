@@ -69,6 +69,21 @@ def test_state_0_and_frozen_poses_stay():
     assert same.tolist() == [[True, True], [True, False], [False, False]]
 
 
+def test_released_poses_change_and_what_slides_does_not_turn():
+    p = poses()
+    released, turning = torch.zeros(3, 2, dtype=torch.bool), torch.ones(3, 2, dtype=torch.bool)
+    released[1], turning[1, 1] = True, False
+    p.release(released, turning)
+    with torch.no_grad():
+        p.rotation.fill_(0.3)
+        p.translation.fill_(0.2)
+    change = p.T() @ p.base.inverse()
+    still = torch.isclose(change, EYE).flatten(2).all(-1)
+    unturned = torch.isclose(change[..., :3, :3], EYE[:3, :3]).flatten(2).all(-1)
+    assert still.tolist() == [[True, True], [False, False], [True, True]]
+    assert unturned.tolist() == [[True, True], [False, True], [True, True]]
+
+
 def test_commit_keeps_the_poses_and_zeroes_the_increments():
     p = poses()
     with torch.no_grad():
