@@ -397,8 +397,8 @@ class PosePipeline(VanillaPipeline):
         """Which poses [S, P] learn along with the merged Gaussians.
 
         Where a part lies against others, as a door does, its edges and what they touch are haze that no view shows;
-        moved, it shows, and shifts the part. Merged Gaussians lose it, for all states say what is there. Of a part that
-        is free all around, like a robot's link, how light falls on it would mislead the pose.
+        moved, it shows, and shifts the part. Merged Gaussians lose it, for all states say what is there. Links of
+        robots, free all around, came out worse, so their poses stay as they were found.
         """
         model, T = self.model, self.model.poses.base
         centroids, radii = part_extents(splats[0], model.num_parts)
