@@ -226,17 +226,21 @@ class PosePipeline(VanillaPipeline):
                 M[s, p] = motion.T.cpu()
                 self._known[s, p] = motion.found
                 self._frozen[s, p] = not motion.found or (snap and motion.still)
-                self.model.alike[p] |= len(motion.alike) > 0
-                self._note_alike(p, s, motion)
+                self.model.alike[p] |= motion.doubtful
+                self._note_doubt(p, s, motion)
         return since_state_0(M, self._known)
 
-    def _note_alike(self, p: int, s: int, motion: InitialMotion) -> None:
-        """Say by which other turns the images show a part as well."""
-        if motion.alike:
+    def _note_doubt(self, p: int, s: int, motion: InitialMotion) -> None:
+        """Say by which other turns the images show a part as well, or that it may not rest."""
+        if not motion.doubtful:
+            return
+        if motion.fits_better is None:
             turn, *others = (f"{math.degrees(so3_log(T[:3, :3]).norm()):.0f}" for T in (motion.T, *motion.alike))
-            part = f"part {self.model.part_names[p + 1]}, state {s}"
-            self.notes.append(f"{part}: turned by {turn} degrees; by {' or '.join(others)} it looks nearly the same.")
-            CONSOLE.log(self.notes[-1], markup=False)
+            doubt = f"turned by {turn} degrees; by {' or '.join(others)} it looks nearly the same."
+        else:
+            doubt = "seems to rest, but other motions fit its images a little better; it may have moved."
+        self.notes.append(f"part {self.model.part_names[p + 1]}, state {s}: {doubt}")
+        CONSOLE.log(self.notes[-1], markup=False)
 
     def _note_unknown(self, known: Tensor) -> None:
         """Say which poses [S, P] of a part no image tells."""
