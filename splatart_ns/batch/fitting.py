@@ -29,8 +29,11 @@ _THUMBNAIL = 96
 """Rows and columns of a picture in the report."""
 
 
-_CHECK = {"digest": str, "states": [{"name": str, "digest": str, "pixels": int}]}
+_TRAINED_ON = ("device", "rasterizer")
+"""What the report says of the machine that trained; the one that finds the joints may have no GPU."""
+_CHECK = {"digest": str, "worlds": str, "states": [{"name": str, "digest": str, "pixels": int}]}
 _TRAINING = {"seconds": NUMBER, "notes": [str]}
+_POSE = _TRAINING | dict.fromkeys(_TRAINED_ON, str)
 _EXPORT = {"failed_checks": [str], "notes": [str]}
 _JOINT = {"name": str, "type": str, "parent": str, "child": str, "residual": NUMBER, "ambiguous": bool}
 _SUMMARY = {
@@ -65,7 +68,9 @@ class Fitting:
             Stage(name, stage_key(name, package, fitting, state["digest"]), (check.name,), needs(state["pixels"]))
             for name, state in ((f"semantic {state['name']}", state) for state in told["states"])
         ]
-        key = stage_key("pose", package, fitting, told["digest"], [stage.key for stage in semantic])
+        # The root brings worlds together, before it is the base of the tree.
+        root = [] if told["worlds"] == "shared" else [settings["root"]]
+        key = stage_key("pose", package, fitting, told["digest"], [stage.key for stage in semantic], *root)
         pixels = sum(state["pixels"] for state in told["states"])
         pose = Stage("pose", key, tuple(stage.name for stage in semantic), needs(pixels))
         light = Needs(memory_mb=_BASE_MB + pixels * _BYTES_PER_PIXEL // 2**20)
@@ -83,8 +88,9 @@ class Fitting:
         from splatart_ns.rasterize.rasterization import set_backend
 
         torch.set_num_threads(1)  # the same sums on every machine
-        set_backend(self.rasterizer)
         kind, _, which = stage.partition(" ")
+        sees_gpu = kind in ("semantic", "pose")
+        set_backend(self.rasterizer if sees_gpu or self.rasterizer != "gsplat" else "auto")
         match kind:
             case "check":
                 return _check(work, self._settings(work)), ()
@@ -96,7 +102,9 @@ class Fitting:
                 return _train(work, stage, self._settings(work))
 
     def outcome_shape(self, stage: str) -> Any:
-        return {"check": _CHECK, "export": _EXPORT, "summary": _SUMMARY}.get(stage.partition(" ")[0], _TRAINING)
+        return {"check": _CHECK, "export": _EXPORT, "summary": _SUMMARY, "pose": _POSE}.get(
+            stage.partition(" ")[0], _TRAINING
+        )
 
     def row(self, entry: Entry, outcomes: dict[str, dict[str, Any]]) -> dict[str, Any]:
         return {key: outcomes["summary"][key] for key in _SUMMARY} | {
@@ -123,6 +131,7 @@ def _check(work: Work, settings: Settings) -> dict[str, Any]:
         shared = repr((capture.normalization.centre.tolist(), capture.normalization.scale))
         return {
             "digest": capture_digest(capture),
+            "worlds": capture.worlds,
             "states": [
                 {
                     "name": state.name,
@@ -147,6 +156,8 @@ def _train(work: Work, stage: str, settings: Settings) -> tuple[dict[str, Any], 
         for name in earlier.get(stage, []):
             work.fetch(_run_folder(configs[name], work.folder))
         outcome = run_stage(configs[stage], lambda steps: None)
+        if stage == "pose":
+            outcome |= {key: report_head(capture, settings)[key] for key in _TRAINED_ON}
         # The run shall open where it will lie.
         at_home = stage_configs(capture, work.home, settings)[stage]
         run = configs[stage].get_base_dir()
@@ -155,6 +166,7 @@ def _train(work: Work, stage: str, settings: Settings) -> tuple[dict[str, Any], 
         if stage == "joint":
             done = {name: work.outcome(name) for name in configs if name != stage} | {stage: outcome}
             told = report_head(capture, settings) | {"capture": work.entry.capture, **_stages_of_report(done)}
+            told |= {key: done["pose"][key] for key in _TRAINED_ON}
             write_json(work.folder / "report.json", told)
             kept += ["report.json", "parts", "articulation.json"]
     return outcome, kept

@@ -48,7 +48,7 @@ class Storage(Protocol):
         """Remove a file if it is there."""
 
     def get(self, path: str, folder: Path) -> None:
-        """Copy all files below a path into a folder."""
+        """Copy all files below a path into a folder. Raises InputError for a name or link that leads out."""
 
     def put(self, file: Path, path: str) -> None:
         """Copy a file of this machine here."""
@@ -132,7 +132,13 @@ class Folder:
         Path(self.url, path).unlink(missing_ok=True)
 
     def get(self, path: str, folder: Path) -> None:
-        shutil.copytree(Path(self.url, path), folder, dirs_exist_ok=True)
+        for name in self.files(path):
+            file, target = Path(self.url, path, name), folder / name
+            # A bundle from a stranger may have links to anything.
+            if not os.path.realpath(file).startswith(os.path.join(os.path.realpath(self.url), "")):
+                raise InputError(f"{file}: leads out of {self.url}; put a copy in its place.")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, target)
 
     def put(self, file: Path, path: str) -> None:
         with replacing(Path(self.url, path)) as temporary:

@@ -24,6 +24,7 @@ from splatart_ns.bundle.posing import (
 from splatart_ns.capture.capture import Normalization
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.camera import viewmat_from_opengl
+from splatart_ns.rasterize.rasterization import default_device
 from splatart_ns.rasterize.render import Rendering, render
 
 _AT_REST: Mapping[str, JointValue] = {}
@@ -74,9 +75,9 @@ class ArticulatedSplat:
     """
 
     def __init__(self, bundle: Bundle, device: torch.device | str | None = None):
-        """`device`: where images are made; CUDA where there is any by default."""
+        """`device`: where images are made; by default CUDA, where there is any and the chosen rasterizer runs there."""
         self.bundle = bundle
-        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        self.device = torch.device(device or default_device())
         parts = [replace(part, splat=part.splat.to(self.device)) for part in bundle.parts]
         self._on_device = replace(bundle, parts=parts)
         self._one_hot = part_features(bundle).to(self.device)

@@ -27,6 +27,6 @@ def choose_rasterizer(rasterizer: Rasterizer) -> None:
 
 def device() -> str:
     """The torch device to work on."""
-    import torch
+    from splatart_ns.rasterize.rasterization import default_device
 
-    return "cuda" if torch.cuda.is_available() else "cpu"
+    return default_device()

@@ -33,7 +33,7 @@ from splatart_ns.method_configs.semantic import method as semantic_method
 from splatart_ns.plugin.companion import Companions, Outcome
 from splatart_ns.plugin.semantic import RefineCameras
 from splatart_ns.plugin.stage_run import num_processes, run_side_by_side, run_stage
-from splatart_ns.rasterize.rasterization import Backend, default_backend, set_backend
+from splatart_ns.rasterize.rasterization import Backend, default_backend, default_device, set_backend
 from splatart_ns.shape import NUMBER, has_shape, parse
 from splatart_ns.stages.joint_constraint import parse_constraints
 from splatart_ns.threads import kernel_threads
@@ -93,7 +93,7 @@ def report_head(capture: Capture, settings: Settings) -> dict[str, Any]:
         "capture_sha256": capture_digest(capture),
         "settings": asdict(settings.of(capture)),
         "seed": settings.seed,
-        "device": "cuda: " + torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
+        "device": "cuda: " + torch.cuda.get_device_name() if default_device() == "cuda" else "cpu",
         "rasterizer": default_backend(),
         "threads": num_cores(),
         "versions": {"python": platform.python_version()}
@@ -280,6 +280,7 @@ def _placed(
     config.pipeline.datamanager.dataparser.worlds = settings.worlds
     config.pipeline.datamanager.dataparser.checked = True
     config.machine.seed = settings.seed
+    config.machine.device_type = default_device()
     config.output_dir = runs
     config.experiment_name = experiment
     config.timestamp = "fit"

@@ -11,6 +11,7 @@ from nerfstudio.models.base_model import Model
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from torch import Tensor, nn
 
+from splatart_ns.errors import InputError
 from splatart_ns.geometry.camera import viewmat_from_opengl
 from splatart_ns.plugin.compat import StartView
 from splatart_ns.plugin.gaussians import gauss_params_from_splat, random_splat, splat_from_points
@@ -50,6 +51,8 @@ class SplatartModel(SplatfactoModel):
         """Gaussians from seed points or at random, strategy and metrics; nothing is downloaded."""
         if self.config.rasterizer != "auto":
             set_backend(self.config.rasterizer)
+            if self.config.rasterizer == "numba" and torch.device(self.kwargs.get("device", "cpu")).type != "cpu":
+                raise InputError("The numba rasterizer runs on the CPU: add --machine.device-type cpu, or take auto.")
         metadata = self.kwargs["metadata"]
         self.part_names = metadata["part_names"]
         self.num_parts = len(self.part_names) - 1

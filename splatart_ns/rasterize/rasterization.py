@@ -38,15 +38,24 @@ def set_backend(backend: Backend) -> None:
     _chosen = backend
 
 
+def default_device() -> str:
+    """The type of device to work on: "cuda" where there is any and the chosen backend runs there, else "cpu"."""
+    return "cuda" if torch.cuda.is_available() and _runs_on(_chosen, "cuda") else "cpu"
+
+
 def default_backend(device_type: str | None = None) -> Backend:
-    """The backend that "auto" stands for on a type of device ("cpu", "cuda", ...), by default this machine's best."""
-    if _chosen != "auto":
+    """The backend that "auto" stands for on a type of device ("cpu", "cuda", ...), by default `default_device`: the
+    chosen one if it runs there, else the best."""
+    device_type = device_type or default_device()
+    if _chosen != "auto" and _runs_on(_chosen, device_type):
         return _chosen
-    if device_type is None:
-        device_type = "cuda" if torch.cuda.is_available() else "cpu"
     if device_type == "cuda":
         return "gsplat"
     return "numba" if device_type == "cpu" and has_numba() else "torch"
+
+
+def _runs_on(backend: Backend, device_type: str) -> bool:
+    return {"numba": "cpu", "gsplat": "cuda"}.get(backend, device_type) == device_type
 
 
 @functools.cache

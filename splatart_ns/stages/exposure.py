@@ -13,15 +13,18 @@ from splatart_ns.splats.splat import Splat
 
 CLIPPED = 250
 """Pixels this bright may have been cut off and tell no gain."""
+DARK = 10 / 255
+"""Nor do channels darker than this, of which rounding and reflections are much: their gains are drawn to 1."""
 
 
 @torch.no_grad()
 def frame_gains(splat: Splat, views: Sequence[View], sh_degree: int | None = None) -> Tensor:
-    """How many times brighter than the splat each view's image is, by channel [N, 3]; their geometric mean is 1.
+    """How many times brighter than the splat each view's image is, by channel [N, 3].
 
-    Least squares between rendering and image on the object's pixels; 1 where none counts.
+    Least squares between rendering and image on the object's pixels; 1 where none counts, and the geometric mean of the
+    others is 1.
     """
-    gains = []
+    gains, tell = [], []
     for view in views:
         camera = view.viewmat[None].to(splat.means), view.K[None].to(splat.means)
         rendering = render(splat, *camera, view.width, view.height, with_depth=False, sh_degree=sh_degree)
@@ -30,10 +33,13 @@ def frame_gains(splat: Splat, views: Sequence[View], sh_degree: int | None = Non
             counts &= (view.alpha > 250)[..., None].to(counts.device)
         shown = rendering.rgb[0] * counts
         image = view.rgb.to(shown) / 255 * counts
-        among, own = (shown * image).sum((0, 1)), shown.square().sum((0, 1))
-        gains.append(torch.where((among > 0) & (own > 0), among / own.clamp_min(1e-12), 1.0))
-    gains = torch.stack(gains)
-    return gains / gains.log().mean(0).exp()
+        dark = DARK**2 * counts.sum()
+        gains.append(((shown * image).sum((0, 1)) + dark) / (shown.square().sum((0, 1)) + dark).clamp_min(1e-12))
+        tell.append(counts.any())
+    gains, tell = torch.stack(gains), torch.stack(tell)
+    if tell.any():
+        gains = gains / gains[tell].log().mean(0).exp()
+    return torch.where(tell[:, None], gains, 1.0)
 
 
 def at_gain(rgb: Tensor, gain: Tensor) -> Tensor:

@@ -65,8 +65,8 @@ as much as turned over, in few views or as they are lit."""
 STILL_RATIO = 1.2
 """A part whose images fit no motion worse than this many times the best motion did not move."""
 RESTS_RATIO = 1.05
-"""Whether it did is in doubt where they fit worse than this: parts that rest measured 1.003 to 1.035 (14 of 13 objects),
-wheels, knobs and a turntable that turned, of which much is hidden, 1.06 to 1.14."""
+"""Whether it did is in doubt where they fit worse than this: parts that rest measured 1.003 to 1.035 (one each of 12
+objects), wheels, knobs and a turntable that turned, of which much is hidden, 1.06 to 1.14 (six of two)."""
 SHADED_RATIO = 2.0
 """Nor one that fits no motion worse than this and would have turned far, if in even light it fits as well unmoved: what
 moved beside it shades it otherwise."""

@@ -3,9 +3,11 @@
 import csv
 import json
 import shutil
+import sys
 
 import pytest
 
+from splatart_ns.batch import fitting
 from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.fitting import Fitting
 
@@ -40,6 +42,22 @@ def test_the_bundle_is_that_of_a_single_fit_bit_for_bit(fitted, hinge_fit):
     for ply in (hinge_fit / "parts").iterdir():
         assert (bundle / "parts" / ply.name).read_bytes() == ply.read_bytes()
     assert (bundle / "export/ply/export.json").exists()
+    ours, single = (json.loads((folder / "report.json").read_text()) for folder in (bundle, hinge_fit))
+    for key in ("device", "rasterizer"):
+        assert ours[key] == single[key]
+
+
+def test_stages_without_a_gpu_take_what_runs_there(monkeypatch):
+    """Of a batch by gsplat only what trains is on a GPU."""
+    asked = []
+    monkeypatch.setattr(sys.modules["splatart_ns.rasterize.rasterization"], "set_backend", asked.append)
+    monkeypatch.setattr(fitting, "_summarize", lambda work: {})
+    monkeypatch.setattr(fitting, "_train", lambda *_: ({}, []))
+    monkeypatch.setattr(Fitting, "_settings", lambda *_: None)
+    for stage in ("semantic state_00", "pose", "joint", "summary"):
+        Fitting(rasterizer="gsplat").run(stage, None)
+    Fitting(rasterizer="torch").run("summary", None)
+    assert asked == ["gsplat", "gsplat", "auto", "auto", "torch"]
 
 
 def test_captures_that_cannot_be_fitted_are_told_with_their_reasons(fitted):
@@ -94,18 +112,21 @@ def stages(settings, told, **recipe):
 
 
 def test_what_depends_on_a_setting_or_a_state_has_another_key():
-    told = {"digest": "all", "states": [{"name": n, "digest": n, "pixels": 10**6} for n in ("s0", "s1")]}
-    other_state = {"digest": "new", "states": [told["states"][0], told["states"][1] | {"digest": "new"}]}
+    states = [{"name": n, "digest": n, "pixels": 10**6} for n in ("s0", "s1")]
+    told = {"digest": "all", "worlds": "shared", "states": states}
+    other_state = told | {"digest": "new", "states": [states[0], states[1] | {"digest": "new"}]}
     first = stages({}, told, exports=("urdf",))
 
-    def changed(settings, told):
+    def changed(settings, told, before=first):
         return {
-            name for name, stage in stages(settings, told, exports=("urdf",)).items() if stage.key != first[name].key
+            name for name, stage in stages(settings, told, exports=("urdf",)).items() if stage.key != before[name].key
         }
 
     last = {"joint", "export urdf", "summary"}
     assert changed({}, told) == set()
     assert changed({"root": "lid"}, told) == last | {"check"}
+    apart = told | {"worlds": "similar"}
+    assert changed({"root": "lid"}, apart, stages({}, apart, exports=("urdf",))) == last | {"check", "pose"}
     assert changed({"seed": 1}, told) == last | {"semantic s0", "semantic s1", "pose"}
     assert changed({}, other_state) == last | {"semantic s1", "pose"}
     assert first["pose"].after == ("semantic s0", "semantic s1") and first["semantic s0"].after == ("check",)

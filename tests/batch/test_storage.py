@@ -80,6 +80,19 @@ def test_a_name_in_a_bucket_cannot_lead_out(object_store, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("link", ["a/parts", "a/parts/x.ply"])
+def test_a_link_in_a_folder_cannot_lead_out(tmp_path, link):
+    secret = tmp_path / "elsewhere/x.ply"
+    secret.parent.mkdir()
+    secret.write_text("secret")
+    source = tmp_path / "bundles" / link
+    source.parent.mkdir(parents=True)
+    source.symlink_to(secret.parent if link.endswith("parts") else secret)
+    with pytest.raises(InputError, match="leads out"):
+        open_storage(str(tmp_path / "bundles")).get("a/parts", tmp_path / "copy")
+    assert not list(tmp_path.glob("copy/**/*.ply"))
+
+
 def test_an_unknown_kind_of_url_is_a_mistake():
     with pytest.raises(InputError, match="nothing://"):
         open_storage("nothing://bucket").read("a")

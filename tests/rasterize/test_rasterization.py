@@ -8,7 +8,7 @@ from scenes import HEIGHT, WIDTH
 from scenes import world_scene as scene
 
 from splatart_ns.errors import InputError
-from splatart_ns.rasterize.rasterization import default_backend, rasterization, set_backend, sh_colors
+from splatart_ns.rasterize.rasterization import default_backend, default_device, rasterization, set_backend, sh_colors
 
 # The package's attribute of that name is the function.
 MODULE = sys.modules["splatart_ns.rasterize.rasterization"]
@@ -158,6 +158,25 @@ def test_the_backend_can_be_chosen_for_the_process(monkeypatch):
         set_backend("gsplat")
 
 
+@pytest.mark.parametrize(
+    "chosen, with_cuda, on_cpu, on_cuda",
+    [
+        ("numba", "cpu", "numba", "gsplat"),
+        ("gsplat", "cuda", "numba", "gsplat"),
+        ("torch", "cuda", "torch", "torch"),
+        ("auto", "cuda", "numba", "gsplat"),
+    ],
+)
+def test_a_chosen_backend_is_used_on_the_devices_that_it_runs_on(monkeypatch, chosen, with_cuda, on_cpu, on_cuda):
+    monkeypatch.setattr(MODULE, "_chosen", "auto")
+    monkeypatch.setattr(MODULE, "has_numba", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    set_backend(chosen)
+    assert (default_device(), default_backend("cpu"), default_backend("cuda")) == (with_cuda, on_cpu, on_cuda)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert default_device() == "cpu"
+
+
 def test_cpu_rendering_never_imports_gsplat(monkeypatch):
     original = builtins.__import__
 
@@ -167,3 +186,4 @@ def test_cpu_rendering_never_imports_gsplat(monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", guarded)
     rasterization(**scene(), backend="auto")
+    rasterization(**{name: value.float() if torch.is_tensor(value) else value for name, value in scene().items()})

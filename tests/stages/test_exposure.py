@@ -40,8 +40,20 @@ def test_exact_frames_need_no_gain(scene):
 
 def test_a_frame_that_is_cut_off_everywhere_tells_no_gain(scene):
     splat, views = scene
-    white = [replace(v, rgb=torch.full_like(v.rgb, 255)) if k == 0 else v for k, v in enumerate(views)]
-    assert torch.allclose(frame_gains(splat, white)[0], torch.ones(3), rtol=0.02)
+    dimmed = exposed(views, [torch.full((3,), 0.5)] * len(views))
+    white = [replace(v, rgb=torch.full_like(v.rgb, 255)) if k == 0 else v for k, v in enumerate(dimmed)]
+    assert torch.allclose(frame_gains(splat, white), torch.ones(len(views), 3), rtol=0.02)
+    assert torch.equal(frame_gains(splat, white[:1]), torch.ones(1, 3))
+
+
+def test_a_dark_channel_tells_no_gain(scene):
+    """What rounding leaves of it may be twice what the splat shows."""
+    splat, views = scene
+    red = replace(splat, sh=splat.sh - torch.tensor([0.0, 3.0, 3.0]))
+    faint = [
+        replace(v, rgb=v.rgb * torch.tensor([1, 0, 0], dtype=torch.uint8) + 2 * (k % 2)) for k, v in enumerate(views)
+    ]
+    assert float(frame_gains(red, faint)[:, 1:].log().std()) < 0.02
 
 
 def test_an_image_keeps_its_type():
