@@ -24,6 +24,9 @@ def read_motions(path: Path, part_names: Sequence[str], num_states: int) -> Tens
     for record in top.records("parts"):
         name = record.choice("name", list(part_names))
         motions[name] = record.motions("motion", record.items("motion"), num_states)
+        if not torch.allclose(motions[name][0], torch.eye(4).to(motions[name]), atol=1e-5):
+            record.fail("motion", "does not begin with the identity", "count motions from state 0")
+        motions[name][0] = torch.eye(4)
     if missing := [name for name in part_names if name not in motions]:
         top.fail("parts", f"lacks {', '.join(missing)}", "give a motion for every part of the capture")
     return torch.stack([motions[name] for name in part_names], dim=1)

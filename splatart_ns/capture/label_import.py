@@ -24,7 +24,7 @@ from splatart_ns.capture.annotations import (
 from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame, State
 from splatart_ns.capture.formats import TRANSFORMS, load_capture, load_states
 from splatart_ns.capture.images import MAX_LABEL, write_png
-from splatart_ns.capture.values import is_inside, read_json, relative_path
+from splatart_ns.capture.values import DISTORTION, is_inside, read_json, relative_path
 from splatart_ns.errors import InputError
 from splatart_ns.files import new_folder, write_json
 
@@ -252,18 +252,22 @@ def _transforms(capture: Capture) -> dict[str, Any]:
                 **{"file_path": image, "state": k, "transform_matrix": frame.T_world_camera.tolist()},
                 **{"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
                 **{"w": camera.width, "h": camera.height},
+                **dict(zip(DISTORTION, camera.distortion, strict=True)),
             }
             own = {
                 "semantics_path": frame.labels,
+                "mask_path": frame.mask,
                 "object_mask_path": frame.object_mask,
                 "depth_file_path": frame.depth,
             }
             for key, file in own.items():
                 if file is not None:
                     entry[key] = file.relative_to(capture.path).as_posix()
+            if frame.depth is not None:
+                entry["depth_unit_scale_factor"] = frame.depth_unit
             frames.append(entry)
             lists[f"{frame.split}_filenames"].append(image)
-    return {"camera_model": "PINHOLE", **lists, "frames": frames}
+    return {"camera_model": "OPENCV", **lists, "frames": frames}
 
 
 def _label_file(root: Path, frame: Frame, taken: set[Path]) -> Path:

@@ -21,7 +21,7 @@ from splatart_ns.errors import InputError
 from splatart_ns.plain_yaml import parse_yaml
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MOST_BYTES = 256 << 20
 LONGEST = 1e12  # a coordinate or focal length beyond this is a mistake, and its square still is a float
 
@@ -184,11 +184,11 @@ def parse_camera(file: Path, owner: str, values: dict[str, Any], image: Path) ->
 def _distortion(file: Path, owner: str, values: dict[str, Any]) -> tuple[float, ...]:
     given = values.get("distortion_params")
     if given is None:
-        given = [0.0 if values.get(key) is None else values[key] for key in _DISTORTION]
-    if not isinstance(given, list) or len(given) != len(_DISTORTION):
+        given = [0.0 if values.get(key) is None else values[key] for key in DISTORTION]
+    if not isinstance(given, list) or len(given) != len(DISTORTION):
         found = f"distortion_params of {owner} is {show(given)}"
         raise CaptureError(file, found, "list k1, k2, k3, k4, p1, p2")
-    out = tuple(parse_number(file, f"{key} of {owner}", value) for key, value in zip(_DISTORTION, given, strict=True))
+    out = tuple(parse_number(file, f"{key} of {owner}", value) for key, value in zip(DISTORTION, given, strict=True))
     if out[3] != 0.0:
         raise CaptureError(
             file, f"k4 of {owner} is {out[3]:g}", "a pinhole camera has no k4 in nerfstudio: undistort the images first"

@@ -107,7 +107,6 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
             outlined = [v for view in views if (v := with_silhouette(view)) is not None]
             around = surrounding_points(views, count, generator) if points is None else points.drawn(count, generator)
             hull = visual_hull(outlined) if outlined else None
-            points = None
             if hull is not None:
                 points = seed_points(outlined, num_parts, count, generator, hull, seen_surface(outlined, *hull))
                 self.train_dataset.metadata["points3D_inside"] = len(points.xyz)

@@ -12,6 +12,8 @@ from splatart_ns.splats.splat import Splat
 FLATNESS = 0.3
 """How thick Gaussians on a known surface start, in their widths. On one object .2 and .5 gave equal pictures, and round
 ones .3 dB less."""
+ALONE = 0.1
+"""How wide a Gaussian starts that has no neighbours."""
 
 
 def gauss_params_from_splat(splat: Splat) -> dict[str, nn.Parameter]:
@@ -58,7 +60,8 @@ def splat_from_points(xyz: Tensor, rgb: Tensor, normals: Tensor, sh_degree: int,
     """
     count = len(xyz)
     distances, _ = cKDTree(xyz.numpy()).query(xyz.numpy(), k=min(4, count))
-    spread = torch.from_numpy(distances[:, 1:]).float().mean(-1, keepdim=True).clamp_min(1e-4)
+    spread = torch.from_numpy(distances.reshape(count, -1)[:, 1:]).float().mean(-1, keepdim=True)
+    spread = spread.nan_to_num(ALONE).clamp_min(1e-4)
     flat = normals.norm(dim=-1, keepdim=True) > 0
     # The shorter turn of z to the normal is about z x n; where they are opposite, about x.
     x, y, z = normals.float().unbind(-1)

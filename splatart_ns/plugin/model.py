@@ -181,7 +181,7 @@ class SplatartModel(SplatfactoModel):
         return self._lpips_module
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """An output with the accumulation as its alpha [H, W, 4] (`ns-render --output-format rgba`)."""
+        """An output with the accumulation as its alpha [H, W, 4] (`ns-render --rendered-output-names rgba`)."""
         accumulation = outputs["accumulation"]
         premultiplied = outputs[output_name] - (1 - accumulation) * outputs["background"]
         colour = (premultiplied / accumulation.clamp_min(1e-3)).clamp(0, 1)

@@ -417,7 +417,7 @@ class PosePipeline(VanillaPipeline):
         """One of the rounds in which merged Gaussians go that the images hardly miss."""
         start, model = time.perf_counter(), self.model
         absence, error = self._absence(turn)
-        if turn == 0:
+        if "thinned" not in self.findings:  # the first round, or the first after a run was resumed
             self._error = error
             self.findings["thinned"] = {"gaussians": [model.num_points] * 2, "added_error": 0.0, "seconds": 0.0}
         told = self.findings["thinned"]

@@ -295,8 +295,9 @@ class SemanticPipeline(VanillaPipeline):
         pairs = zip(self._views, model.viewmats.float().cpu(), strict=True)
         self._views = [replace(view, viewmat=viewmat) for view, viewmat in pairs]
         poses = inverse(model.viewmats) * torch.tensor([1.0, -1.0, -1.0, 1.0]).to(model.viewmats)
-        cameras = self.datamanager.train_cameras.camera_to_worlds
-        cameras.copy_(poses[:, :3].to(cameras))
+        # The datamanager takes a copy of its dataset's whenever it loads images, those of an evaluation, too.
+        for cameras in (self.datamanager.train_cameras, self.datamanager.train_dataset.cameras):
+            cameras.camera_to_worlds.copy_(poses[:, :3].to(cameras.camera_to_worlds))
         self._slack = slack(self._views)[0] if self._slack else 0
         if due[-1] is PASSES[-1]:
             change = camera_change(model.viewmats, self._given)

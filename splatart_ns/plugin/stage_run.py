@@ -27,6 +27,8 @@ def run_stage(config: TrainerConfig, on_step: Callable[[int], None]) -> Outcome:
     """Train a stage; `on_step` gets the number of finished steps."""
     seed_everything(config.machine.seed)
     start = time.perf_counter()
+    if torch.cuda.is_available():
+        torch.cuda.reset_peak_memory_stats()
     config.save_config()
     trainer: Trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
@@ -112,7 +114,7 @@ def run_side_by_side(
 
 
 def _peak_memory_mb() -> int:
-    """Of the GPU where there is one, else of this process so far."""
+    """Of the GPU in this stage where there is one, else of this process so far."""
     if torch.cuda.is_available():
         return torch.cuda.max_memory_allocated() // 2**20
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -119,7 +119,7 @@ def part_view(
     weight = ((own | background) & ~unlabelled).float()
     if view.mask is not None:
         weight = weight * view.mask
-    if not (weight * own).any() and view.labels is not None:
+    if not weight.any() or view.labels is not None and not (weight * own).any():
         return None
     rgba = torch.cat([view.rgb.float() / 255 * alpha[..., None], alpha[..., None]], -1)
 

@@ -228,7 +228,7 @@ def rotation_held_ratios(splats: Sequence[Splat], views: Sequence[Sequence[View]
     """How much worse part b's images fit when b may only slide against part a [P, P], row a, column b.
 
     Measured at the state where b turned most against a; NaN where it turned more than `MAYBE_SLIDING` (it does not
-    slide), where b did not move against a, and where no labelled view shows b.
+    slide), where b did not turn against a, and where no labelled view shows b.
     """
     P = T.shape[1]
     out = torch.full((P, P), torch.nan)

@@ -30,8 +30,11 @@ def surrounding_points(views: Sequence[View], count: int, generator: torch.Gener
     place = torch.rand(count, 2, generator=generator)
     points, colours = torch.zeros(count, _DEPTHS, 3), torch.zeros(count, 3)
     own = torch.zeros(count, 3 * len(_BLURS))
-    blurred = [_blurred(view) for view in views]
+    every, looks = -(-len(views) // _MOST_VIEWS), []
     for i, view in enumerate(views):
+        blurred = _blurred(view)
+        if i % every == 0:
+            looks.append((view, blurred))
         mine = (index == i).nonzero()[:, 0]
         column = (place[mine, 0] * view.width).long()
         row = (place[mine, 1] * view.height).long()
@@ -42,9 +45,9 @@ def surrounding_points(views: Sequence[View], count: int, generator: torch.Gener
         rays = pixels @ torch.linalg.inv(view.K).T @ T_world_camera[:3, :3].T
         points[mine] = T_world_camera[:3, 3] + depths[:, None] * rays[:, None]
         colours[mine] = view.rgb[row, column].float()
-        own[mine] = blurred[i][row, column]
+        own[mine] = blurred[row, column]
     differences = []
-    for view, image in list(zip(views, blurred, strict=True))[:: -(-len(views) // _MOST_VIEWS)]:
+    for view, image in looks:
         column, row, _, visible = project(view, points.reshape(-1, 3))
         difference = (image[row, column].reshape(count, _DEPTHS, -1) - own[:, None]).abs().mean(-1)
         differences.append(torch.where(visible.reshape(count, _DEPTHS), difference, torch.nan))

@@ -123,7 +123,7 @@ def infer_tree(
     joints = {edge: fit for edge, fit in joints.items() if edge not in blind}
     contacts = find_contacts(points, motions, {_pair(*edge) for edge, fit in joints.items() if fit.accepted}, known)
     groups = _free_groups(points, motions, joints, contacts, root, radius, required)
-    contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups})
+    contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups}, known)
     tree = build_tree(sorted(points), joints | groups, contacts, root, radius, required)
     reached = set(points) - set(tree.unattached) - {base for _, base in groups}
     reasons = {base: _why_unattached(base, reached, joints, radius) for _, base in groups}
@@ -219,7 +219,7 @@ def _free_groups(
     touching += [edge for b, a in required.items() for edge in ((a, b), (b, a))]
     groups = {}
     while left:
-        group = reached_from(touching, min(left))
+        group = reached_from([(a, b) for a, b in touching if {a, b} <= left], min(left))
         left -= group
         if len(group) > 1:
             base = choose_root({p: points[p] for p in group if p not in required}, motions, object_radius)

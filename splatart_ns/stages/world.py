@@ -147,7 +147,6 @@ def world_record(state: str, part: str, T: Tensor, fit: WorldFit) -> dict[str, A
         "scale_deviation": float(scale_of(T) * scale),
         "turn_deviation_degrees": math.degrees(float(turn)),
         "residual_ratio": fit.ratio,
-        "covariance": fit.covariance.tolist(),
     }
 
 

@@ -10,7 +10,7 @@ from label_exports import flat_name, roboflow_name, write_coco, write_masks, wri
 from splatart_ns.capture.check import check_capture
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.images import read_labels
-from splatart_ns.capture.label_import import import_capture, import_labels
+from splatart_ns.capture.label_import import _transforms, import_capture, import_labels
 from splatart_ns.errors import InputError
 
 
@@ -87,6 +87,25 @@ def test_labels_of_paris_come_back_bit_for_bit(paris_folder, tmp_path, write):
         return f"{state.name}_{frame.name.replace('/', '_')}"
 
     bit_for_bit(paris_folder, tmp_path, lambda c: write(c, tmp_path / "export", whole_path))
+
+
+def test_a_transforms_json_for_another_layout_says_all_that_its_files_said(capture_folder):
+    """ArtGS' cameras may be distorted, and count depth in other units."""
+
+    def told(capture):
+        return [[(f.camera, f.depth_unit, f.split) for f in state.frames] for state in capture.states]
+
+    capture = load_capture(capture_folder)
+    for state in capture.states:
+        frame = state.frames[0]
+        camera = dataclasses.replace(frame.camera, distortion=(0.02, 0.001, 0.0, 0.0, 1e-4, -2e-4))
+        object.__setattr__(frame, "camera", camera)
+        object.__setattr__(frame, "depth", frame.image)
+        object.__setattr__(frame, "depth_unit", 0.25)
+        (capture_folder / state.name / "transforms.json").unlink()
+    content = _transforms(capture) | {"semantic_classes": ["background", *capture.parts.values()]}
+    (capture_folder / "transforms.json").write_text(json.dumps(content))
+    assert told(load_capture(capture_folder)) == told(capture)
 
 
 def test_an_export_of_each_state_lies_in_a_folder_of_its_name(capture_folder, tmp_path):

@@ -20,6 +20,11 @@ def test_gaussians_on_a_known_surface_lie_flat_on_it(normal):
     assert (vectors[:, :, 0] @ normal.double()).abs().min() > 1 - 1e-4
 
 
+def test_a_single_point_makes_a_gaussian():
+    splat = splat_from_points(torch.zeros(1, 3), torch.full((1, 3), 128.0), torch.zeros(1, 3), 0, 1)
+    assert splat.log_scales.isfinite().all() and len(splat) == 1
+
+
 def test_gaussians_are_round_where_no_surface_is_known():
     normals = torch.zeros(27, 3)
     normals[0, 2] = 1

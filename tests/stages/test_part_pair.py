@@ -42,6 +42,12 @@ def test_an_unlabelled_view_tells_only_of_the_background(scene):
     assert (piece.weight == 0).any() and (piece.weight == 1).any()
 
 
+def test_an_unlabelled_view_without_background_tells_nothing(scene):
+    close_up = replace(scene[1][0][0], labels=None, alpha=torch.full_like(scene[1][0][0].alpha, 255))
+    assert part_view(close_up, 2) is None
+    assert part_view(replace(scene[1][0][0], labels=None, mask=torch.zeros_like(close_up.alpha)), 2) is None
+
+
 def test_a_smaller_piece_shows_the_same(scene):
     splats, views = scene
     part = splats[0].select(splats[0].part_ids == 2)

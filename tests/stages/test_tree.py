@@ -13,7 +13,7 @@ from splatart_ns.stages.joint import NOISE
 from splatart_ns.stages.joint_constraint import JointConstraint, parse_constraints
 from splatart_ns.stages.joint_fit import JointFit
 from splatart_ns.stages.joint_pairs import fit_pairs, surface_error
-from splatart_ns.stages.tree import build_tree, choose_root, infer_tree, object_radius
+from splatart_ns.stages.tree import _free_groups, build_tree, choose_root, infer_tree, object_radius
 
 Z, X, Y = (torch.tensor(v, dtype=torch.float64) for v in ((0, 0, 1.0), (1.0, 0, 0), (0, 1.0, 0)))
 
@@ -317,6 +317,21 @@ def test_parts_that_hang_together_but_on_nothing_else_are_carried_by_a_free_join
     T = forward_kinematics(tree, tree.observed(), root_motion=motions[1])
     for k, part in enumerate(tree.part_ids):
         assert torch.allclose(T[:, k], motions[part], atol=1e-9)
+
+
+def test_what_hangs_on_the_root_joins_no_group_that_no_joint_explains():
+    """Part 3 hangs on the root, but nothing on it, as of one that state 0 hides; part 2 seems jointed to it."""
+    points = {p: box((0.3 * p, 0, 0), (0.3, 0.3, 0.3), p) for p in (1, 2, 3)}
+    hinge = true_joint(1, 3, "revolute", Z, (0.75, 0, 0)).fit
+    still = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    motions = {
+        1: still,
+        2: hinge.motion(torch.tensor([0.0, 0.9]).double()),
+        3: hinge.motion(torch.tensor([0.0, 0.4]).double()),
+    }
+    joints = {(1, 3): hinge, (2, 3): hinge}
+    contacts = find_contacts(points, motions, {(1, 3), (2, 3)})
+    assert _free_groups(points, motions, joints, contacts, 1, 1.0, {}) == {}
 
 
 def test_two_hinges_in_a_row_are_not_one_ball_joint():
