@@ -62,6 +62,7 @@ def semantic_trainer(tmp_path: Path) -> SemanticTrainer:
         config.max_num_iterations, config.pipeline.model.semantic_start = steps, semantic_start
         config.pipeline.datamanager.seed_gaussians = config.pipeline.model.num_random = 300
         torch.manual_seed(0)
+        config.machine.device_type = "cpu"  # what tests compare with lies there
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         return trainer

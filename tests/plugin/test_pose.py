@@ -32,6 +32,7 @@ def semantic_runs(capture_dir: Path, tmp_path_factory: pytest.TempPathFactory) -
         config.pipeline.datamanager.seed_gaussians = 400
         torch.manual_seed(0)
         config.save_config()
+        config.machine.device_type = "cpu"  # what tests compare with lies there
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         trainer.train()
@@ -54,6 +55,7 @@ def pose_trainer(capture_dir, semantic_runs, tmp_path):
         for name, value in pipeline.items():
             setattr(config.pipeline, name, value)
         config.max_num_iterations, config.pipeline.model.pose_steps = steps, pose_steps
+        config.machine.device_type = "cpu"  # what tests compare with lies there
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         return trainer
