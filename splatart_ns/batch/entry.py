@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from splatart_ns.batch.storage import Storage, open_storage
+from splatart_ns.batch.storage import Storage, join, open_storage
 from splatart_ns.errors import InputError
 
 _TRANSFORMS = "transforms.json"
@@ -68,24 +68,20 @@ def _captures(storage: Storage, path: str) -> list[str] | None:
         raise InputError(f"{storage.url}/{path}: lies too deep; give a folder that is nearer to the captures.")
     folders, files = (set(names) for names in storage.children(path))
     if _TRANSFORMS in files:
-        return [path] if _holds_states(storage.read(_join(path, _TRANSFORMS))) else None
-    if {"start", "end"} <= folders and "camera_train.json" in storage.children(_join(path, "start"))[1]:
+        return [path] if _holds_states(storage.read(join(path, _TRANSFORMS))) else None
+    if {"start", "end"} <= folders and "camera_train.json" in storage.children(join(path, "start"))[1]:
         return [path]
     if any(files.issuperset(mark) for mark in _MARKS):
         return [path]
     inner = {
         below: _captures(storage, below)
-        for below in (_join(path, name) for name in sorted(folders) if name != "eval" and not name.startswith("."))
+        for below in (join(path, name) for name in sorted(folders) if name != "eval" and not name.startswith("."))
     }
     captures = [capture for found in inner.values() for capture in found or ()]
     states = [below for below, found in inner.items() if found is None]
     if states and not captures:
         return [path]
     return sorted(captures + states)  # a state among captures: one of them, and its file is broken
-
-
-def _join(path: str, name: str) -> str:
-    return f"{path}/{name}" if path else name
 
 
 def _holds_states(data: bytes | None) -> bool:

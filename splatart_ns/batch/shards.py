@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.stage import Needs, Stage, Work, stage_key
-from splatart_ns.batch.storage import Storage, open_storage
+from splatart_ns.batch.storage import Storage, join, open_storage
 from splatart_ns.capture.synthesis_options import MOST_PIXELS
 from splatart_ns.errors import InputError
 
@@ -44,7 +44,7 @@ class ShardOptions:
 
 
 def find_bundles(source: str) -> list[str]:
-    """Folders of bundles below a folder or URL, relative to it, in order.
+    """Folders of bundles at or below a folder or URL, relative to it, in order.
 
     Raises:
         InputError: there is none.
@@ -57,7 +57,7 @@ def find_bundles(source: str) -> list[str]:
             found.append(path)
             continue
         inner = (name for name in sorted(folders, reverse=True) if not name.startswith("."))
-        paths += [f"{path}/{name}" if path else name for name in inner]
+        paths += [join(path, name) for name in inner]
     if not found:
         raise InputError(f"{source}: there is no bundle in it; give the --output-dir of `splatart batch`.")
     return found
@@ -131,9 +131,9 @@ class Sharding:
         first, count, total = (work.entry.settings[key] for key in ("first", "count", "of"))
         samples: dict[int, dict[str, bytes]] = {}
         for place, name in enumerate(work.entry.settings["bundles"]):
-            dataset = self._dataset(work, name)
+            dataset, title = self._dataset(work, name), name or work.entry.capture.rsplit("/", 1)[-1]
             for image in range(first + place, first + count, total):
-                samples[image] = _encode(dataset, dataset[image // total], name)
+                samples[image] = _encode(dataset, dataset[image // total], title)
         with tarfile.open(path, "w") as tar:
             for image in sorted(samples):
                 for suffix, data in samples[image].items():
@@ -148,8 +148,8 @@ class Sharding:
 
         source, folder = open_storage(work.entry.capture), work.folder.parent / "bundle-read"
         (folder / "parts").mkdir(parents=True, exist_ok=True)
-        source.get(f"{name}/parts", folder / "parts")
-        (folder / _ARTICULATION).write_bytes(source.read(f"{name}/{_ARTICULATION}") or b"")
+        source.get(join(name, "parts"), folder / "parts")
+        (folder / _ARTICULATION).write_bytes(source.read(join(name, _ARTICULATION)) or b"")
         # Bundles of one seed would be seen from the same places.
         own = hashlib.sha256(json.dumps([self.options.seed, name]).encode()).digest()
         options = DatasetOptions(
@@ -159,9 +159,9 @@ class Sharding:
 
 
 def _stamps(source: Storage, name: str) -> list[tuple[str, int, str]]:
-    files = source.files(f"{name}/parts")
+    files = source.files(join(name, "parts"))
     parts = sorted((file, info.size, info.stamp) for file, info in files.items())
-    articulation = source.read(f"{name}/{_ARTICULATION}") or b""
+    articulation = source.read(join(name, _ARTICULATION)) or b""
     return [*parts, (_ARTICULATION, len(articulation), hashlib.sha256(articulation).hexdigest())]
 
 
@@ -169,8 +169,8 @@ def _digest(work: Work) -> str:
     """Of all that is rendered of the shard's bundles."""
     source, digest = open_storage(work.entry.capture), hashlib.sha256()
     for name in work.entry.settings["bundles"]:
-        paths = [f"{name}/{_ARTICULATION}", *(f"{name}/parts/{file}" for file in sorted(source.files(f"{name}/parts")))]
-        for path in paths:
+        parts = join(name, "parts")
+        for path in (join(name, _ARTICULATION), *(f"{parts}/{file}" for file in sorted(source.files(parts)))):
             digest.update(path.encode() + b"\0" + (source.read(path) or b""))
     return digest.hexdigest()
 

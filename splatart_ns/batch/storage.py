@@ -66,6 +66,11 @@ def open_storage(url: str) -> Storage:
     return ObjectStore(url.rstrip("/"))
 
 
+def join(path: str, name: str) -> str:
+    """A path below another, which may be "", the storage itself."""
+    return f"{path}/{name}" if path else name
+
+
 @dataclass(frozen=True)
 class Folder:
     """A folder of this machine, or one that all machines share."""

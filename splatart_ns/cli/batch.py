@@ -53,7 +53,7 @@ class Shards:
     """
 
     root: Annotated[str, tyro.conf.Positional]
-    """A folder or fsspec URL above bundles, as the output folder of `splatart batch`."""
+    """A bundle, or a folder or fsspec URL above bundles, as the output folder of `splatart batch`."""
     output_dir: str
     """A folder or an fsspec URL, for shard-NNNNNN/images.tar."""
     images: int

@@ -88,6 +88,12 @@ def test_shards_hold_labelled_images_and_one_can_be_made_again_alone(bundles, ma
     assert (out / "shard-000000/images.tar").stat().st_mtime_ns == other
 
 
+def test_one_bundle_is_enough(bundles, make, tmp_path):
+    told = make(bundles / "a", tmp_path, ShardOptions(images=2, states=2, resolution=24))
+    assert set(told.status().values()) == {"done"}
+    assert json.loads(members(tmp_path / "shard-000000/images.tar")["000000000.json"])["object"] == "a"
+
+
 @pytest.mark.parametrize("options", [{"images": 0}, {"shard_size": 0}, {"states": 0}])
 def test_options_without_sense_are_mistakes(bundles, options):
     with pytest.raises(InputError, match=f"--{next(iter(options)).replace('_', '-')}"):
