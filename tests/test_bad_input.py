@@ -271,6 +271,8 @@ def test_a_bundle_among_the_files_of_the_capture_is_refused(refused, capture):
     before = contents(capture)
     for output in (capture, capture / "state_00", capture / "state_01" / "new"):
         assert "holds the capture's files" in refused("fit", capture, "--output-dir", output, "--quality", "draft")
+    for output in (capture, capture.parent, capture / "state_00"):
+        assert "choose another --output-dir" in refused("batch", capture, "--output-dir", output)
     assert contents(capture) == before
 
 

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from splatart_ns.batch.batch import run_batch
 from splatart_ns.batch.cluster import RayCluster
-from splatart_ns.batch.entry import Entry, read_entries
+from splatart_ns.batch.entry import Entry, check_apart, read_entries
 from splatart_ns.batch.fitting import Fitting
 from splatart_ns.batch.pool import ProcessPool
 from splatart_ns.batch.progress import LiveProgress
@@ -36,7 +36,9 @@ def fit_captures(
     if not 0 <= settings["seed"] < 2**32:
         raise InputError(f"--seed is {settings['seed']}; give 0 to {2**32 - 1}.")
     recipe = Fitting(rasterizer, tuple(dict.fromkeys(exports)))
-    return _run(read_entries(source, settings), out_url, recipe, address, retry_failed, console, "objects")
+    entries = read_entries(source, settings)
+    check_apart(entries, open_storage(out_url))
+    return _run(entries, out_url, recipe, address, retry_failed, console, "objects")
 
 
 def write_shards(

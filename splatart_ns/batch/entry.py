@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import PurePath
 from typing import Any
 
-from splatart_ns.batch.storage import Storage, join, open_storage
+from splatart_ns.batch.storage import Folder, Storage, join, open_storage
 from splatart_ns.errors import InputError
 
 _TRANSFORMS = "transforms.json"
@@ -51,6 +53,22 @@ def read_entries(source: str, settings: dict[str, Any]) -> list[Entry]:
         raise InputError(f"{source}: there is no capture in it; give a folder above captures, or a .csv or .jsonl.")
     _check_names(source, entries)
     return entries
+
+
+def check_apart(entries: Iterable[Entry], out: Storage) -> None:
+    """Raises InputError where a bundle would be, hold or lie in a capture of this machine."""
+    if not isinstance(out, Folder):
+        return
+    local = {entry.capture: open_storage(entry.capture) for entry in entries}
+    captures = {PurePath(os.path.realpath(at.url)) for at in local.values() if isinstance(at, Folder)}
+    bundles = {PurePath(os.path.realpath(os.path.join(out.url, entry.name))) for entry in entries}
+    for paths, others in ((bundles, captures), (captures, bundles)):
+        for path in paths:
+            if not others.isdisjoint((path, *path.parents)):
+                raise InputError(
+                    f"{path}: a bundle would lie among a capture's files, or around them; choose another --output-dir, "
+                    "beside the captures."
+                )
 
 
 def _find(storage: Storage, settings: dict[str, Any]) -> list[Entry]:

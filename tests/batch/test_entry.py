@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from splatart_ns.batch.entry import read_entries
+from splatart_ns.batch.entry import check_apart, read_entries
+from splatart_ns.batch.storage import open_storage
 from splatart_ns.errors import InputError
 
 SETTINGS = {"quality": "standard", "root": None, "seed": 0, "joints": []}
@@ -60,6 +61,24 @@ def test_no_capture_at_all_is_a_mistake(make, tmp_path, content):
         make(content)
     with pytest.raises(InputError, match="no capture"):
         names(tmp_path / "notes")
+
+
+@pytest.mark.parametrize("out", ["captures", "captures/a", "captures/a/state_00/new", "link"])
+def test_bundles_among_the_captures_files_are_refused(make, tmp_path, out):
+    make("captures/a/state_00/transforms.json")
+    make("captures/kitchen/b/state_00/transforms.json")
+    (tmp_path / "link").symlink_to(tmp_path / "captures")
+    entries = read_entries(str(tmp_path / "captures"), SETTINGS)
+    check_apart(entries, open_storage(str(tmp_path / "captures/new")))
+    with pytest.raises(InputError, match="choose another --output-dir"):
+        check_apart(entries, open_storage(str(tmp_path / out)))
+
+
+def test_a_bundle_around_a_capture_is_refused(make, tmp_path):
+    make("kitchen/deep/state_00/transforms.json")
+    make("list.csv", "path,name\nkitchen/deep,kitchen\n")
+    with pytest.raises(InputError, match=f"{tmp_path}/kitchen/deep: a bundle would lie"):
+        check_apart(read_entries(str(tmp_path / "list.csv"), SETTINGS), open_storage(str(tmp_path)))
 
 
 def test_captures_in_an_object_store_are_found(object_store):
