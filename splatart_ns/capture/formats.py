@@ -125,9 +125,15 @@ def read_capture(path: Path | str, report: Report) -> Capture:
         states=tuple(states),
         parts=read_part_names(metas, frames, report),
         worlds=_worlds(metas, report),
-        length_unit=next((unit for _, m in metas if isinstance(unit := m.get("length_unit"), str)), "unknown"),
+        length_unit=_length_unit(metas),
         normalization=Normalization.from_frames(frames),
     )
+
+
+def _length_unit(metas: Sequence[_Meta]) -> str:
+    """What the first transforms.json that names one gives as "length_unit"."""
+    units = (meta.get("length_unit") for _, meta in metas)
+    return next((unit for unit in units if isinstance(unit, str) and unit.strip()), "unknown")
 
 
 def _worlds(metas: Sequence[_Meta], report: Report) -> Worlds:

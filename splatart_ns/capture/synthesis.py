@@ -62,7 +62,7 @@ def synthesize(urdf: Path, output_dir: Path, options: SynthesisOptions | None = 
 
 def _check(options: SynthesisOptions) -> None:
     def refuse(name: str, rule: str) -> None:
-        raise InputError(f"The option {name.replace('_', '-')} is {getattr(options, name)}; give {rule}.")
+        raise InputError(f"The option {name.replace('_', '-')} is {getattr(options, name)!r}; give {rule}.")
 
     ranges = {"states": (2, 1000), "train_views": (1, 100_000), "test_views": (0, 100_000), "samples": (1, 64)}
     for name, (least, most) in (ranges | {"resolution": (8, MOST_PIXELS)}).items():
@@ -76,6 +76,8 @@ def _check(options: SynthesisOptions) -> None:
         refuse("labelled_fraction", "0 to 1")
     if options.views not in ("sphere", "hemisphere"):
         refuse("views", "sphere or hemisphere")
+    if not options.length_unit.strip():
+        refuse("length_unit", "a name, as metre")
     if options.seed < 0:
         refuse("seed", "0 or more")
     if len(options.joint_values) == 1:

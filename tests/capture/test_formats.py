@@ -140,6 +140,12 @@ def test_optional_files_and_points_are_found(capture_folder, edit):
     assert [p.name for p in found] == ["o.png", "m.png", "d.npy"]
 
 
+@pytest.mark.parametrize("blank", ["", "  "])
+def test_a_blank_unit_of_length_is_none(capture_folder, edit, blank):
+    edit(capture_folder / FILE, lambda meta: meta.update(length_unit=blank))
+    assert load_capture(capture_folder).length_unit == "unknown"
+
+
 def test_a_count_of_depth_is_a_millimetre_unless_the_file_or_the_frame_says_otherwise(capture_folder, edit):
     def change(meta):
         meta["depth_unit_scale_factor"] = 0.25

@@ -207,6 +207,7 @@ def test_a_frozen_joint_joins_its_links(urdf, tmp_path):
         ({"train_views": 0}, "train-views is 0"),
         ({"labelled_fraction": 1.5}, "labelled-fraction is 1.5"),
         ({"fov_degrees": 0.0}, "fov-degrees is 0"),
+        ({"length_unit": " "}, "length-unit is ' '"),
     ],
 )
 def test_options_that_make_no_sense_are_refused_and_leave_nothing(urdf, tmp_path, change, says):
