@@ -73,9 +73,10 @@ def import_labels(path: Path, labels: Path) -> LabelImport:
     frames, `semantic_classes`. PARIS folders get a transforms.json, which has a place for them.
 
     An image of the export belongs to the frame of the same stem, or of the same path joined in any way (Roboflow's
-    `state_00_0001_jpg.rf.<hash>.jpg` to `state_00/images/0001.jpg`); where states have frames of one stem, a folder of
-    the export named after the state tells them apart. The classes that the capture declares keep their ids, others
-    follow in the export's order. Frames that the export does not label stay as they are.
+    `state_00_0001_jpg.rf.<hash>.jpg`, Label Studio's `<hash>-state_00_0001.jpg` to `state_00/images/0001.jpg`); where
+    states have frames of one stem, a folder of the export named after the state tells them apart. The classes that the
+    capture declares keep their ids, others follow in the export's order. Frames that the export does not label stay as
+    they are.
 
     Raises:
         InputError: anything that cannot be read or written; labels that fit no frame, or not the frames' sizes.
@@ -164,7 +165,8 @@ def _match(capture: Capture, labels: Path, annotations: Annotations) -> tuple[li
     unmatched = []
     for image in annotations.images:
         path = _exported_path(image.name)
-        found = named.get(_key(str(path))) or named.get(_key(path.name), [])
+        keys = [_key(text) for p in (path, _without_prefix(path)) for text in (str(p), p.name)]
+        found = next((named[key] for key in keys if key in named), [])
         if len(found) > 1:
             found = [(s, f) for s, f in found if s.name in path.parts] or found
         if len(found) > 1:
@@ -211,8 +213,13 @@ def _exported_path(name: str) -> PurePosixPath:
     if path.suffix.lower() in IMAGE_SUFFIXES:
         path = path.with_suffix("")
     if found := re.fullmatch(r"(.+?)(_(png|jpe?g|webp|bmp|tiff?))?\.rf\.\w+", path.name, flags=re.IGNORECASE):
-        path = path.with_name(found[1])
+        path = path.parent / found[1]
     return path
+
+
+def _without_prefix(path: PurePosixPath) -> PurePosixPath:
+    """The path before Label Studio put 8 hex digits before its name: `a/1a2b3c4d-x` is `a/x`."""
+    return path.parent / re.sub("^[0-9a-f]{8}-", "", path.name)
 
 
 def _part_ids(labels: Path, parts: list[str], classes: Sequence[str]) -> np.ndarray:

@@ -26,6 +26,10 @@ def roboflow_name(state: State, frame: Frame) -> str:
     return f"{name.stem}_{name.suffix[1:]}.rf.9f3c1a{abs(hash(frame.name)) % 1000:03d}.jpg"
 
 
+def label_studio_name(state: State, frame: Frame) -> str:
+    return f"images/{abs(hash(frame.name)) % 16**8:08x}-{flat_name(state, frame)}"
+
+
 def outlines(mask: np.ndarray) -> list[list[float]]:
     """Polygons along the pixel borders of a mask: a rectangle for each run of pixels in a row."""
     polygons = []

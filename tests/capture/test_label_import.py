@@ -5,7 +5,7 @@ import os
 import cv2
 import numpy as np
 import pytest
-from label_exports import flat_name, roboflow_name, write_coco, write_masks, write_yolo
+from label_exports import flat_name, label_studio_name, roboflow_name, write_coco, write_masks, write_yolo
 
 from splatart_ns.capture.check import check_capture
 from splatart_ns.capture.formats import load_capture
@@ -56,8 +56,10 @@ EXPORTS = {
     "COCO runs": lambda c, out: write_coco(c, out / "instances.json", "runs"),
     "COCO compressed runs": lambda c, out: write_coco(c, out / "a/_annotations.coco.json", "compressed", roboflow_name),
     "COCO folder": lambda c, out: write_coco(c, out / "train/_annotations.coco.json", "runs").parents[1],
+    "COCO of Label Studio": lambda c, out: write_coco(c, out / "result.json", "polygons", label_studio_name),
     "YOLO": write_yolo,
     "YOLO of Roboflow": lambda c, out: write_yolo(c, out, roboflow_name),
+    "YOLO of Label Studio": lambda c, out: write_yolo(c, out, label_studio_name),
     "masks": lambda c, out: write_masks(c, out, flat_name),
     "masks of Roboflow": write_masks,
 }
@@ -158,6 +160,13 @@ def test_declared_parts_keep_their_ids_and_new_ones_follow(capture_folder, tmp_p
     capture = load_capture(capture_folder)
     assert capture.parts == {1: "base", 2: "door", 3: "handle"}
     assert set(np.unique(read_labels(capture.states[0].frames[0].labels))) == {0, 2, 3}
+
+
+@pytest.mark.parametrize("name", ["1a2b3c4d-", "1a2b3c4d-.", "..rf.x", "."])
+def test_names_of_nothing_but_what_tools_add_fit_no_frame(capture_folder, tmp_path, edit, name):
+    export = write_coco(load_capture(capture_folder), tmp_path / "labels.json", "runs")
+    edit(export, lambda e: e["images"][0].update(file_name=name))
+    assert len(import_labels(capture_folder, export).unmatched) == 1
 
 
 def test_images_without_a_frame_are_told(capture_folder, tmp_path, edit):
