@@ -60,6 +60,13 @@ def read_annotations(path: Path) -> Annotations:
 
     Raises `InputError` for anything else.
     """
+    annotations = _read(path)
+    if not annotations.images:
+        raise CaptureError(path, "it labels no image", "export labelled images")
+    return annotations
+
+
+def _read(path: Path) -> Annotations:
     if os.path.isfile(path):
         return _read_coco(path.parent, path, read_json(path))
     if not path.is_dir():
@@ -80,7 +87,8 @@ def read_annotations(path: Path) -> Annotations:
 
 
 def _merged(exports: Sequence[Annotations]) -> Annotations:
-    """Files of one project (train, valid, test, or one a state), whose lists of classes must be the same."""
+    """Files of one project (train, valid, test, or one a state); those that label images must have the same classes."""
+    exports = [export for export in exports if export.images] or exports[:1]
     for export in exports[1:]:
         if export.classes != exports[0].classes:
             first, other = exports[0].images[0].file, export.images[0].file
@@ -121,7 +129,8 @@ def _read_coco(root: Path, file: Path, content: dict[str, Any]) -> Annotations:
     place = {i: k for k, i in enumerate(named, start=1)}
     if unknown := used - set(place):
         raise CaptureError(file, f"category_id {min(unknown)} is in no category", "export the labels again")
-    _check_classes(file, list(named.values()))
+    if drawn:
+        _check_classes(file, list(named.values()))
 
     images = []
     for image in objects("images"):
@@ -134,8 +143,6 @@ def _read_coco(root: Path, file: Path, content: dict[str, Any]) -> Annotations:
             images.append(AnnotatedImage(file, path, (width, height), _CocoShapes(file, path, shapes)))
     if drawn:
         raise CaptureError(file, f"image_id {min(drawn)} of an annotation is no image's", "export the labels again")
-    if not images:
-        raise CaptureError(file, "it labels no image", "export labelled images")
     return Annotations("COCO", tuple(named.values()), tuple(images))
 
 
@@ -198,8 +205,6 @@ def _read_yolo(path: Path, files: Sequence[Path], texts: Sequence[Path]) -> Anno
             picture = pictures.get(beside) or pictures.get(file.with_suffix(""))
             name = file.relative_to(path).with_suffix("").as_posix()
             images.append(AnnotatedImage(file, name, picture and image_size(picture), _YoloShapes(shapes)))
-    if not images:
-        raise CaptureError(path, "it labels no image", "export labelled images")
     return Annotations("YOLO", tuple(classes), tuple(images))
 
 

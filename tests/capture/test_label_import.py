@@ -169,6 +169,14 @@ def test_names_of_nothing_but_what_tools_add_fit_no_frame(capture_folder, tmp_pa
     assert len(import_labels(capture_folder, export).unmatched) == 1
 
 
+@pytest.mark.parametrize("categories", [{}, {"categories": []}])
+def test_a_split_without_annotations_labels_nothing(capture_folder, tmp_path, edit, categories):
+    for split in ("train", "valid"):
+        write_coco(load_capture(capture_folder), tmp_path / f"export/{split}/_annotations.coco.json", "runs")
+    edit(tmp_path / "export/valid/_annotations.coco.json", lambda e: e.update(annotations=[], **categories))
+    assert import_labels(capture_folder, tmp_path / "export").labelled == 16
+
+
 def test_images_without_a_frame_are_told(capture_folder, tmp_path, edit):
     export = write_coco(load_capture(capture_folder), tmp_path / "labels.json", "runs")
     edit(export, lambda e: e["images"][0].update(file_name="elsewhere.png"))
