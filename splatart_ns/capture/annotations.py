@@ -75,7 +75,7 @@ def _read(path: Path) -> Annotations:
     jsons = [(f, read_json(f)) for f in files if f.suffix == ".json"]
     if coco := [(f, content) for f, content in jsons if "annotations" in content and "images" in content]:
         return _merged([_read_coco(path, f, content) for f, content in coco])
-    if texts := _yolo_texts(files):
+    if texts := _yolo_texts(path, files):
         return _read_yolo(path, files, texts)
     if pngs := [f for f in files if f.suffix.lower() == ".png"]:
         return _read_masks(path, files, pngs)
@@ -188,9 +188,11 @@ def _corners(file: Path, what: str, values: Any) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- YOLO
 
 
-def _yolo_texts(files: Sequence[Path]) -> list[Path]:
+def _yolo_texts(path: Path, files: Sequence[Path]) -> list[Path]:
     texts = [f for f in files if f.suffix == ".txt" and f.name not in _CLASS_LISTS]
-    return [f for f in texts if "labels" in f.parts] or [f for f in texts if not f.name.upper().startswith("README")]
+    return [f for f in texts if "labels" in f.relative_to(path).parts] or [
+        f for f in texts if not f.name.upper().startswith("README")
+    ]
 
 
 def _read_yolo(path: Path, files: Sequence[Path], texts: Sequence[Path]) -> Annotations:
@@ -201,10 +203,10 @@ def _read_yolo(path: Path, files: Sequence[Path], texts: Sequence[Path]) -> Anno
         shapes = list(_yolo_shapes(file, len(classes)))
         if shapes:
             # .../labels/train/x.txt belongs to .../images/train/x.jpg.
-            beside = Path(*["images" if part == "labels" else part for part in file.with_suffix("").parts])
-            picture = pictures.get(beside) or pictures.get(file.with_suffix(""))
-            name = file.relative_to(path).with_suffix("").as_posix()
-            images.append(AnnotatedImage(file, name, picture and image_size(picture), _YoloShapes(shapes)))
+            name = file.relative_to(path).with_suffix("")
+            beside = path.joinpath(*["images" if part == "labels" else part for part in name.parts])
+            picture = pictures.get(beside) or pictures.get(path / name)
+            images.append(AnnotatedImage(file, name.as_posix(), picture and image_size(picture), _YoloShapes(shapes)))
     return Annotations("YOLO", tuple(classes), tuple(images))
 
 

@@ -169,6 +169,15 @@ def test_names_of_nothing_but_what_tools_add_fit_no_frame(capture_folder, tmp_pa
     assert len(import_labels(capture_folder, export).unmatched) == 1
 
 
+def test_an_export_may_lie_in_a_folder_of_any_name(capture_folder, tmp_path):
+    export = write_yolo(load_capture(capture_folder), tmp_path / "labels")
+    assert import_labels(capture_folder, export).labelled == 16
+    (export / "train/images").mkdir()
+    cv2.imwrite(str(export / "train/images/state_00_0000.png"), np.zeros((8, 8), np.uint8))
+    with pytest.raises(InputError, match="'train/labels/state_00_0000' is 8x8 pixels"):
+        import_labels(capture_folder, export)
+
+
 @pytest.mark.parametrize("categories", [{}, {"categories": []}])
 def test_a_split_without_annotations_labels_nothing(capture_folder, tmp_path, edit, categories):
     for split in ("train", "valid"):
