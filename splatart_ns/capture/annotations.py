@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ BACKGROUND_NAMES = ("background", "bg")
 UNLABELLED_NAMES = ("unlabelled", "unlabeled", "ignore", "void")
 """Classes of these names are no parts."""
 _CLASS_LISTS = ("classes.txt", "obj.names", "_darknet.labels")
+_CLASS_YAMLS = ("data.yaml", "data.yml", "dataset.yaml")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 
@@ -68,6 +70,8 @@ def read_annotations(path: Path) -> Annotations:
 
 def _read(path: Path) -> Annotations:
     if os.path.isfile(path):
+        if zipfile.is_zipfile(path):
+            raise CaptureError(path, "it is a zip", "unpack it first and give the folder")
         return _read_coco(path.parent, path, read_json(path))
     if not path.is_dir():
         raise CaptureError(path, "there are no labels here", "give the file or the folder that the tool exported")
@@ -189,10 +193,21 @@ def _corners(file: Path, what: str, values: Any) -> np.ndarray:
 
 
 def _yolo_texts(path: Path, files: Sequence[Path]) -> list[Path]:
+    """Texts in folders called `labels`; without any, all where there is a data.yaml or one of them looks like YOLO."""
     texts = [f for f in files if f.suffix == ".txt" and f.name not in _CLASS_LISTS]
-    return [f for f in texts if "labels" in f.relative_to(path).parts] or [
-        f for f in texts if not f.name.upper().startswith("README")
-    ]
+    if inner := [f for f in texts if "labels" in f.relative_to(path).parts]:
+        return inner
+    texts = [f for f in texts if not f.name.upper().startswith("README")]
+    return texts if any(f.name in _CLASS_YAMLS for f in files) or any(_is_yolo(f) for f in texts) else []
+
+
+def _is_yolo(file: Path) -> bool:
+    """Whether a text begins with a class number and the coordinates of a polygon or box."""
+    try:
+        number, *coordinates = read_text(file).lstrip().partition("\n")[0].split()
+        return number.isdecimal() and len([float(x) for x in coordinates]) >= 4
+    except (CaptureError, ValueError):
+        return False
 
 
 def _read_yolo(path: Path, files: Sequence[Path], texts: Sequence[Path]) -> Annotations:
@@ -212,7 +227,7 @@ def _read_yolo(path: Path, files: Sequence[Path], texts: Sequence[Path]) -> Anno
 
 def _yolo_classes(path: Path, files: Sequence[Path]) -> list[str]:
     found = []
-    for file in (f for f in files if f.name in ("data.yaml", "data.yml", "dataset.yaml")):
+    for file in (f for f in files if f.name in _CLASS_YAMLS):
         content = read_yaml(file)
         names = content.get("names") if isinstance(content, dict) else None
         if isinstance(names, dict) and list(names) == list(range(len(names))):
@@ -289,6 +304,9 @@ def _mask_classes(path: Path, files: Sequence[Path]) -> dict[int, str]:
     found = [(file, _csv_classes(file)) for file in files if file.name == "_classes.csv"]
     if found:
         named = _the_one(found)
+    elif colours := [file for file in files if file.name == "labelmap.txt"]:
+        found = "its masks hold colours, as CVAT's Segmentation mask has them"
+        raise CaptureError(colours[0], found, "export the labels as COCO 1.0")
     else:
         names = _listed_classes(path, files, "_classes.csv or classes.txt")
         named = dict(enumerate(names, start=0 if names[:1] and names[0].lower() in BACKGROUND_NAMES else 1))

@@ -1,6 +1,8 @@
 import dataclasses
 import json
 import os
+import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -178,6 +180,23 @@ def test_an_export_may_lie_in_a_folder_of_any_name(capture_folder, tmp_path):
         import_labels(capture_folder, export)
 
 
+def test_texts_beside_masks_are_not_taken_for_labels(capture_folder, tmp_path):
+    export = write_masks(load_capture(capture_folder), tmp_path / "export", flat_name)
+    (export / "train/_classes.csv").unlink()
+    (export / "classes.txt").write_text("base\ndoor\n")
+    (export / "notes.txt").write_bytes(b"labelled by Ren\xe9\n")
+    (export / "todo.txt").write_text("3 frames are left\n")
+    assert import_labels(capture_folder, export).format == "masks"
+
+
+def test_polygons_need_no_data_yaml_to_be_known(capture_folder, tmp_path):
+    export = write_yolo(load_capture(capture_folder), tmp_path / "export")
+    (export / "data.yaml").unlink()
+    (export / "classes.txt").write_text("base\ndoor\nignore\n")
+    (export / "train/labels").rename(export / "texts")
+    assert import_labels(capture_folder, export).format == "YOLO"
+
+
 @pytest.mark.parametrize("categories", [{}, {"categories": []}])
 def test_a_split_without_annotations_labels_nothing(capture_folder, tmp_path, edit, categories):
     for split in ("train", "valid"):
@@ -212,6 +231,21 @@ def change_text(pattern, text):
     return make
 
 
+def zipped(capture, folder):
+    write_coco(capture, folder / "labels.json", "runs")
+    return Path(shutil.make_archive(folder, "zip", folder)).replace(folder / "labels.zip")
+
+
+def segmentation_mask(capture, folder):
+    """As CVAT writes it."""
+    write_masks(capture, folder, flat_name)
+    (folder / "train/_classes.csv").unlink()
+    (folder / "train").rename(folder / "SegmentationClass")
+    (folder / "labelmap.txt").write_text("# label:color_rgb:parts:actions\nbackground:0,0,0::\nbase:250,50,83::\n")
+    (folder / "default.txt").write_text("0000\n0001\n0002\n0003\n0004\n")
+    return folder
+
+
 def segmentation(value):
     return change_coco(lambda e: e["annotations"][0].update(segmentation=value))
 
@@ -241,6 +275,8 @@ BAD_EXPORTS = {
     "YOLO without NaN": (change_text("train/labels/*0003.txt", "0 nan 0.1 0.2 0.1 0.2 0.2"), "nan"),
     "YAML with code": (change_text("data.yaml", "names: !!python/object/apply:os.getcwd []"), "not YAML"),
     "YAML without names": (change_text("data.yaml", "names: 3"), "names is 3"),
+    "zip": (zipped, "it is a zip; unpack it first"),
+    "masks of colours": (segmentation_mask, "export the labels as COCO 1.0"),
     "nothing": (lambda c, folder: folder, "there are no labels here"),
 }
 
