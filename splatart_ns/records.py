@@ -94,7 +94,8 @@ class Record:
                 for item in v:
                     check(item, dims[1:])
             elif dims or isinstance(v, bool) or not isinstance(v, int | float) or not abs(v) < most:
-                self.fail(key, f"holds {_shown(v)}", f"give finite numbers of shape {list(shape)}")
+                mend = f"give finite numbers of shape {list(shape)}" if shape else "give a number"
+                self.fail(key, f"holds {_shown(v)}", mend)
 
         check(value, shape)
         return torch.tensor(value, dtype=torch.float64)
@@ -112,7 +113,7 @@ def read_record(path: Path, mend: str) -> Record:
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path}: is larger than {_MOST_BYTES >> 20} MiB; {mend}")
-        value = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_constant)
+        value = json.loads(path.read_text(encoding="utf-8-sig"), parse_constant=_no_constant)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {mend}") from error
     except (ValueError, RecursionError) as error:
