@@ -50,7 +50,8 @@ def read_entries(source: str, settings: dict[str, Any]) -> list[Entry]:
     manifest = source.lower().endswith((".csv", ".jsonl"))
     entries = _read_manifest(source, settings) if manifest else _find(open_storage(source), settings)
     if not entries:
-        raise InputError(f"{source}: there is no capture in it; give a folder above captures, or a .csv or .jsonl.")
+        found = "there is no capture in it (links to folders are not followed)"
+        raise InputError(f"{source}: {found}; give a folder above captures, or a .csv or .jsonl that names them.")
     _check_names(source, entries)
     return entries
 
@@ -124,12 +125,15 @@ def _read_manifest(source: str, settings: dict[str, Any]) -> list[Entry]:
 def _csv_rows(source: str, text: str) -> Iterable[tuple[int, dict[str, Any]]]:
     reader = csv.DictReader(io.StringIO(text), strict=True)
     try:
+        columns = [name.strip() for name in reader.fieldnames or ()]
+        if twice := sorted(name for name in set(columns) if name and columns.count(name) > 1):
+            raise InputError(f"{source}, line {reader.line_num}: has the column {twice[0]!r} twice; leave one out.")
         for row in reader:
             if None in row or None in row.values():
                 raise InputError(f"{source}, line {reader.line_num}: has not as many fields as the header; mend it.")
             row = {key.strip(): value.strip() for key, value in row.items() if value.strip()}
             if "joints" in row:
-                row["joints"] = [joint.strip() for joint in row["joints"].split(";")]
+                row["joints"] = [joint.strip() for joint in row["joints"].split(";") if joint.strip()]
             if re.fullmatch("[0-9]{1,10}", row.get("seed", "")):
                 row["seed"] = int(row["seed"])
             yield reader.line_num, row

@@ -55,6 +55,16 @@ def test_the_folder_may_be_a_capture_itself(make, tmp_path):
     assert names(tmp_path / "scissors") == ["scissors"]
 
 
+def test_links_to_captures_are_not_followed_but_can_be_named(make, tmp_path):
+    make("elsewhere/scissors/state_00/transforms.json")
+    (tmp_path / "captures").mkdir()
+    (tmp_path / "captures/a").symlink_to(tmp_path / "elsewhere/scissors")
+    with pytest.raises(InputError, match="links to folders are not followed"):
+        names(tmp_path / "captures")
+    make("list.csv", "path\ncaptures/a\n")
+    assert names(tmp_path / "list.csv") == ["a"]
+
+
 @pytest.mark.parametrize("content", [None, "notes/readme.txt"])
 def test_no_capture_at_all_is_a_mistake(make, tmp_path, content):
     if content is not None:
@@ -96,7 +106,8 @@ def test_captures_in_an_object_store_are_found(object_store):
 
 def test_a_csv_says_what_is_special_about_an_object(make, tmp_path):
     make(
-        "list.csv", "path,name,quality,root,seed,joints\ncaps/a,,,,,\n/b,bee,draft,base,7,lid:base=revolute; knob:lid\n"
+        "list.csv",
+        "path,name,quality,root,seed,joints,,\ncaps/a,,,,,,,\n/b,bee,draft,base,7,lid:base=revolute; knob:lid;,,\n",
     )
     first, second = read_entries(str(tmp_path / "list.csv"), SETTINGS)
     assert (first.name, first.capture, first.settings) == ("a", f"{tmp_path}/caps/a", SETTINGS)
@@ -123,6 +134,7 @@ def test_json_lines_do_so_too(make, tmp_path):
         ("path,quality\na,best\n", "'best'; give one of draft, standard, high"),
         ("path,name\na\n", "line 2: has not as many fields"),
         ('path\n"a\n', "is no CSV"),
+        ("path,seed, path\na,1,b\n", "line 1: has the column 'path' twice"),
         ("path\nx/a\ny/a\n", "both 'a' and 'a'"),
         ("path,name\na,A\nb,a\n", "both 'A' and 'a'"),
         ("path,name\na,../a\n", "'../a'"),
