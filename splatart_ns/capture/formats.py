@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -89,7 +90,7 @@ def read_capture(path: Path | str, report: Report) -> Capture:
     path = Path(path)
     if not path.is_dir():
         raise CaptureError(path, "the capture is not a folder", "give the folder that holds the states")
-    folders = [f for f in _subfolders(path) if f.name != "eval"]
+    folders = _subfolders(path)
     single = os.path.isfile(path / TRANSFORMS)
     if folders and single:
         raise CaptureError(
@@ -152,16 +153,25 @@ def _worlds(metas: Sequence[_Meta], report: Report) -> Worlds:
 
 
 def _subfolders(path: Path) -> list[Path]:
-    """The folders in `path` that hold a transforms.json, in natural order: state_2 before state_10."""
+    """The folders in `path` but `eval` that hold a transforms.json, in natural order: state_2 before state_10."""
     if not path.is_dir():
         return []
-    found = [f for f in path.iterdir() if not f.name.startswith(".") and os.path.isfile(f / TRANSFORMS)]
+    found = [f for f in path.iterdir() if f.name != "eval" and not f.name.startswith(".") and _is_state(f)]
 
     def key(folder: Path) -> tuple[list[str | int], str]:
         pieces = re.split(r"(\d+)", folder.name)  # digits, and only they, at the odd places
         return [int(s) if i % 2 else s for i, s in enumerate(pieces)], folder.name
 
     return sorted(found, key=key)
+
+
+def _is_state(folder: Path) -> bool:
+    try:
+        return stat.S_ISREG(os.stat(folder / TRANSFORMS).st_mode)
+    except PermissionError:
+        raise CaptureError(folder, "the folder cannot be read", "make it readable, or move it elsewhere") from None
+    except OSError:
+        return False
 
 
 def _read_folders(folders: Sequence[Path], root: Path, report: Report) -> tuple[list[State], list[_Meta]]:

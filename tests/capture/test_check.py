@@ -1,5 +1,7 @@
 import json
+import os
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -88,6 +90,19 @@ def test_the_first_error_is_raised_with_the_number_of_the_others(capture_folder)
 def test_one_state_shows_no_motion(capture_folder):
     shutil.rmtree(capture_folder / "state_01")
     assert found(check_capture(capture_folder)) == ["capture: there is only the state state_00"]
+
+
+def test_a_folder_that_cannot_be_read_is_named(capture_folder, monkeypatch):
+    stat = os.stat
+
+    def denied(path, **options):
+        if not isinstance(path, int) and Path(path).parent == capture_folder / "state_00":
+            raise PermissionError
+        return stat(path, **options)
+
+    monkeypatch.setattr(os, "stat", denied)
+    (problem,) = check_capture(capture_folder)
+    assert problem.file == capture_folder / "state_00" and "cannot be read" in problem.message
 
 
 def test_a_broken_state_leaves_the_other_checked(capture_folder):
