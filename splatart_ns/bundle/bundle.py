@@ -10,6 +10,7 @@ from torch import Tensor
 
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.joint_parameters import JOINT_DOFS as JOINT_DOFS
+from splatart_ns.stages.joint_parameters import JOINT_LENGTHS as JOINT_LENGTHS
 
 
 @dataclass

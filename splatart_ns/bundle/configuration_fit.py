@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
+from splatart_ns.bundle.bundle import JOINT_DOFS, JOINT_LENGTHS, Bundle, Joint
 from splatart_ns.bundle.posing import configured_motions, joint_motion, normalized
 from splatart_ns.capture.capture import Normalization
 from splatart_ns.capture.view import View
@@ -170,13 +170,9 @@ def _split(joints: Sequence[Joint], x: Tensor) -> dict[str, Tensor]:
 
 def _units(joint: Joint, normalization: Normalization) -> Tensor:
     """What one unit of refinement is in each value: a radian, or a normalised length."""
-    length = 1 / normalization.scale
-    units = {
-        "prismatic": [length],
-        "cylindrical": [length, 1.0],
-        "free": [length] * 3 + [1.0] * 3,
-    }.get(joint.type, [1.0] * JOINT_DOFS[joint.type])
-    return torch.tensor(units, dtype=torch.float64)
+    units = torch.ones(JOINT_DOFS[joint.type], dtype=torch.float64)
+    units[: JOINT_LENGTHS.get(joint.type, 0)] = 1 / normalization.scale
+    return units
 
 
 def _to_normal(T: Tensor, normalization: Normalization) -> Tensor:

@@ -9,16 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
+from splatart_ns.bundle.bundle import JOINT_DOFS, JOINT_LENGTHS, Bundle, Joint
 from splatart_ns.errors import InputError
 from splatart_ns.records import LONGEST, read_record
 
 Configuration = dict[str, float | list[float]]
 """Joint name to value, radian or length, or to as many as the joint has freedoms (`Joint.values`); joints that are not
 named are at 0, where state 0 has them."""
-
-_LENGTHS = {"prismatic": 1, "cylindrical": 1, "free": 3}
-"""How many of a joint's first values are lengths; the others are angles."""
 
 
 def movable_joints(bundle: Bundle) -> dict[str, Joint]:
@@ -45,7 +42,7 @@ def parse_value(text: str, joint: Joint, where: str) -> float | list[float]:
 
     Joints of several freedoms take as many, with commas between: lengths first, then angles.
     """
-    dofs, lengths = JOINT_DOFS[joint.type], _LENGTHS.get(joint.type, 0)
+    dofs, lengths = JOINT_DOFS[joint.type], JOINT_LENGTHS.get(joint.type, 0)
     numbers = text.split(",")
     if len(numbers) != dofs:
         raise InputError(

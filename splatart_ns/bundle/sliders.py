@@ -8,24 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle
+from splatart_ns.bundle.bundle import JOINT_DOFS, JOINT_LENGTHS, Bundle
 from splatart_ns.bundle.configurations import Configuration, movable_joints
 
-_TURNS = tuple((f" turn {axis}", True) for axis in "xyz")
-_SLIDES = tuple((f" {axis}", False) for axis in "xyz")
-_SEVERAL = {
-    "cylindrical": ((" slide", False), (" turn", True)),
-    "spherical": _TURNS,
-    "free": _SLIDES + _TURNS,
-}
+_TURNS = " turn x", " turn y", " turn z"
+_SEVERAL = {"cylindrical": (" slide", " turn"), "spherical": _TURNS, "free": (" x", " y", " z", *_TURNS)}
 
 
 def freedoms(joint_type: str) -> tuple[tuple[str, bool], ...]:
     """For each degree of freedom, in the order of a joint's values: what its slider is called besides the joint, and
     whether the value is an angle."""
-    if JOINT_DOFS[joint_type] == 0:
-        return ()
-    return _SEVERAL.get(joint_type, (("", joint_type != "prismatic"),))
+    names = _SEVERAL.get(joint_type, ("",) * JOINT_DOFS[joint_type])
+    return tuple((name, index >= JOINT_LENGTHS.get(joint_type, 0)) for index, name in enumerate(names))
 
 
 def unit_name(turns: bool, length_unit: str) -> str:

@@ -31,7 +31,7 @@ from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.joint_constraint import parse_constraints
 from splatart_ns.stages.joint_fit import JointFit
-from splatart_ns.stages.joint_parameters import JOINT_DOFS
+from splatart_ns.stages.joint_parameters import JOINT_DOFS, JOINT_LENGTHS
 from splatart_ns.stages.pose import carry
 from splatart_ns.stages.tree import EPSILON, JointMethod, infer_tree
 from splatart_ns.stages.unseen import known_states, place_unseen
@@ -173,8 +173,9 @@ def normal_values(fit: JointFit, normalization: Normalization) -> Tensor:
     """A joint's values in the normalised world."""
     if fit.type == "free":
         return se3_log(torch.from_numpy(normalization.motion_to_normal(se3_exp(fit.values).numpy(force=True))))
-    lengths = {"prismatic": normalization.scale, "cylindrical": torch.tensor([normalization.scale, 1.0]).to(fit.values)}
-    return fit.values * lengths.get(fit.type, 1.0)
+    values = fit.values.clone()
+    (values if values.ndim > 1 else values[:, None])[:, : JOINT_LENGTHS.get(fit.type, 0)] *= normalization.scale
+    return values
 
 
 @dataclass

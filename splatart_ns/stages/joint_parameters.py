@@ -18,6 +18,8 @@ from splatart_ns.geometry.se3 import (
 
 JOINT_DOFS = {"fixed": 0, "prismatic": 1, "revolute": 1, "screw": 1, "cylindrical": 2, "spherical": 3, "free": 6}
 """Degrees of freedom by joint type, the simplest first."""
+JOINT_LENGTHS = {"prismatic": 1, "cylindrical": 1, "free": 3}
+"""How many of a joint's first values are lengths; the others are angles."""
 Joints = tuple[Tensor, Tensor, Tensor, Tensor]
 """B joints of one type about their children's centroids: axes [B, 3], their points nearest the centroid [B, 3], pitches
 [B], values [B, n, D] at the states 1 and up."""
