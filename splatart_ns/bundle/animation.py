@@ -91,14 +91,18 @@ def write_frames(frames: Iterable[np.ndarray], path: Path, fps: float = 30.0) ->
 def _write_pngs(frames: Iterable[np.ndarray], folder: Path) -> int:
     count = 0
     for frame in frames:
-        with replacing(folder / f"frame_{count:04d}.png") as temporary:
+        with replacing(folder / _frame_name(count)) as temporary:
             Image.fromarray(frame).save(temporary)
         count += 1
     for stale in folder.glob("frame_*.png"):
         number = stale.stem.removeprefix("frame_")
-        if number.isdecimal() and int(number) >= count:
+        if number.isdecimal() and int(number) >= count and stale.name == _frame_name(int(number)):
             stale.unlink()
     return count
+
+
+def _frame_name(number: int) -> str:
+    return f"frame_{number:04d}.png"
 
 
 def _write_gif(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:

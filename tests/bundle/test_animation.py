@@ -82,6 +82,14 @@ def test_pngs_replace_those_of_a_longer_run(tmp_path):
     assert np.array_equal(np.asarray(Image.open(tmp_path / "frame_0001.png")), FRAMES[1])
 
 
+def test_pngs_that_others_named_stay(tmp_path):
+    theirs = ["frame_00001.png", "frame_00007.png", "frame_7.png", "frame_\u0661\u0662\u0663\u0664.png"]
+    for name in theirs:
+        (tmp_path / name).write_bytes(b"theirs")
+    write_frames(iter(FRAMES), tmp_path)
+    assert {p.name for p in tmp_path.iterdir() if p.read_bytes() == b"theirs"} == set(theirs)
+
+
 def test_a_gif_has_all_frames(tmp_path):
     assert write_frames(iter(FRAMES), tmp_path / "new" / "a.gif", fps=10) == 3
     with Image.open(tmp_path / "new" / "a.gif") as image:
