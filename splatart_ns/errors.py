@@ -1,4 +1,9 @@
-"""The one exception for what a user can mend."""
+"""The one exception for what a user can mend, and what full disks raise."""
+
+import errno
+
+DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+"""Of a disk that takes no more; what writes to an open file raises them without its name."""
 
 
 class InputError(Exception):

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from splatart_ns.errors import InputError
+from splatart_ns.errors import DISK_ERRORS, InputError
 
 
 @contextmanager
@@ -22,11 +22,12 @@ def replacing(path: Path) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}.tmp{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with errors_about(path, temporary):
+        try:
+            yield temporary
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -42,14 +43,28 @@ def new_folder(path: Path) -> Iterator[Path]:
         temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); give another output folder.") from error
+    with errors_about(path, temporary):
+        try:
+            temporary.chmod(0o755)
+            yield temporary
+            if path.exists():
+                path.rmdir()
+            os.replace(temporary, path)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def errors_about(path: Path, temporary: Path) -> Iterator[None]:
+    """Let errors about `temporary`, or what lies in it, name `path`; so do those of a full disk that name nothing."""
     try:
-        temporary.chmod(0o755)
-        yield temporary
-        if path.exists():
-            path.rmdir()
-        os.replace(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        yield
+    except OSError as error:
+        nameless = error.filename is None and error.errno in DISK_ERRORS
+        named = temporary if nameless else Path(str(error.filename))
+        if not named.is_relative_to(temporary):
+            raise
+        raise OSError(error.errno, error.strerror, str(path / named.relative_to(temporary))) from error
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -25,19 +27,27 @@ COMMAND = [sys.executable, "-c", "from splatart_ns.cli import main; main()"]
 def start_splatart() -> Callable[..., subprocess.Popen]:
     """Starts `splatart` with these arguments as a process of its own."""
 
-    def start(*arguments: object) -> subprocess.Popen:
+    def start(*arguments: object, stdout: int | IO = subprocess.PIPE) -> subprocess.Popen:
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
-        pipe = subprocess.PIPE
         return subprocess.Popen(
             [*COMMAND, *map(str, arguments)],
-            stdout=pipe,
-            stderr=pipe,
+            stdout=stdout,
+            stderr=subprocess.PIPE,
             text=True,
             env=environment,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells let background jobs ignore it
         )
 
     return start
+
+
+@pytest.fixture
+def small_files() -> Iterator[None]:
+    """Lets files of this process grow to 1000 bytes only, as if the disk were full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.fixture

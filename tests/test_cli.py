@@ -76,6 +76,22 @@ def test_a_reader_that_stops_reading_ends_the_command_quietly(start_splatart, hi
     assert process.wait() == 141
 
 
+@pytest.mark.parametrize("arguments", [["check"], ["--help"]], ids=str)
+def test_output_that_finds_no_room_ends_the_command_with_a_sentence(start_splatart, hinge_capture, arguments):
+    capture = [hinge_capture] if arguments == ["check"] else []
+    with open("/dev/full", "w") as full:
+        process = start_splatart(*arguments, *capture, stdout=full)
+        _, errors = process.communicate()
+    assert process.returncode == 2
+    assert errors.startswith("error: ") and "(No space left on device)" in errors and errors.count("\n") == 1
+
+
+def test_pictures_that_find_no_room_are_named_and_gone(run_main, hinge_fit, tmp_path, small_files):
+    code, _, errors = run_main("render", hinge_fit, "--output", tmp_path / "a.gif", *SMALL)
+    assert code == 2 and f"{tmp_path / 'a.gif'}: cannot be read or written (File too large)" in errors
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_check_tells_all_problems(run_main, hinge_capture, tmp_path):
     capture = shutil.copytree(hinge_capture, tmp_path / "capture")
     (capture / "state_00/images/0001.png").unlink()

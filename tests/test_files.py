@@ -1,9 +1,10 @@
+import errno
 import json
 import math
 
 import pytest
 
-from splatart_ns.files import replacing, write_json
+from splatart_ns.files import new_folder, replacing, write_json
 
 
 def test_a_block_that_ends_well_puts_the_file_in_place(tmp_path):
@@ -24,6 +25,21 @@ def test_a_block_that_fails_leaves_the_last_good_file(tmp_path):
         raise RuntimeError
     assert path.read_text() == "good"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("writing", [replacing, new_folder])
+def test_errors_name_what_shall_be_written_not_the_temporary(tmp_path, writing):
+    path, full = tmp_path / "a", OSError(errno.ENOSPC, "No space left on device")
+    with pytest.raises(FileNotFoundError) as about_file, writing(path) as temporary:
+        (temporary / "new/b").open()
+    assert about_file.value.filename == str(path / "new/b")
+    with pytest.raises(OSError, match="No space") as about_disk, writing(path):
+        raise full
+    assert about_disk.value.filename == str(path)
+    with pytest.raises(FileNotFoundError) as about_other, writing(path):
+        (tmp_path / "other").open()
+    assert about_other.value.filename == str(tmp_path / "other")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_not_finite_becomes_null(tmp_path):

@@ -18,7 +18,7 @@ from splatart_ns.cli.capture import Check, Import, Labels, Segment, Synth
 from splatart_ns.cli.demo import Demo
 from splatart_ns.cli.fit import Fit
 from splatart_ns.cli.render import Render
-from splatart_ns.errors import InputError
+from splatart_ns.errors import DISK_ERRORS, InputError
 
 _COMMANDS = {"fit": Fit, "render": Render, "view": View, "eval": Evaluate, "check": Check, "import": Import}
 _COMMANDS |= {"labels": Labels, "segment": Segment}
@@ -32,21 +32,39 @@ def main() -> None:
     warnings.filterwarnings("ignore", category=FutureWarning)
     warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True")
     try:
-        tyro.extras.subcommand_cli_from_dict(_COMMANDS, prog="splatart", description=__doc__).run()
-        sys.stdout.flush()
-    except BrokenPipeError:  # as of `splatart check CAPTURE | head`; what is left to print has nowhere to go
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        _run()
+    except BrokenPipeError:  # as of `splatart check CAPTURE | head`
+        _print_no_more()
         raise SystemExit(141) from None
     except InputError as error:
         message = str(error)
         print(f"error: {message}" + ("" if message.endswith(".") else "."), file=sys.stderr)
         raise SystemExit(2) from None
     except OSError as error:
-        if error.filename is None:
+        if error.filename is not None:
+            mend = "check the path, its permissions and the space on the disk"
+            print(f"error: {error.filename}: cannot be read or written ({error.strerror}); {mend}.", file=sys.stderr)
+        elif error.errno in DISK_ERRORS:
+            _print_no_more()
+            mend = "check the space on the disk, also where the output goes"
+            print(f"error: A file cannot be written ({error.strerror}); {mend}.", file=sys.stderr)
+        else:
             raise
-        mend = "check the path, its permissions and the space on the disk"
-        print(f"error: {error.filename}: cannot be read or written ({error.strerror}); {mend}.", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         print("Interrupted. An unfinished fit or batch goes on when it is started again.", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def _run() -> None:
+    try:
+        tyro.extras.subcommand_cli_from_dict(_COMMANDS, prog="splatart", description=__doc__).run()
+    except SystemExit:
+        sys.stdout.flush()
+        raise
+    sys.stdout.flush()
+
+
+def _print_no_more() -> None:
+    """Let what is left to print, which has nowhere to go, vanish."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

@@ -15,7 +15,19 @@ from splatart_ns.capture.formats import load_capture
 from splatart_ns.errors import InputError
 from splatart_ns.plugin.companion import Companions
 from splatart_ns.plugin.fit import Report, Settings, _semantic_config, _train
-from splatart_ns.plugin.stage_run import num_processes, run_side_by_side
+from splatart_ns.plugin.stage_run import num_processes, run_side_by_side, run_stage
+
+
+def test_a_checkpoint_that_finds_no_room_is_refused_in_one_sentence(configs, monkeypatch, request):
+    from nerfstudio.engine.trainer import Trainer
+
+    def train(trainer):
+        request.getfixturevalue("small_files")
+        trainer.save_checkpoint(0)
+
+    monkeypatch.setattr(Trainer, "train", train)
+    with pytest.raises(InputError, match="nerfstudio_models: cannot be written .*checkpoint"):
+        run_stage(configs[0], lambda steps: None)
 
 
 @pytest.fixture

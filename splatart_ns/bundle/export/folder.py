@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from splatart_ns.errors import InputError
-from splatart_ns.files import write_json
+from splatart_ns.files import errors_about, write_json
 from splatart_ns.records import read_record
 
 MANIFEST = "export.json"
@@ -31,7 +31,8 @@ def export_folder(path: Path, about: dict) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent) as scratch:
         fresh = Path(scratch) / "new"
         fresh.mkdir()
-        yield fresh
+        with errors_about(path, fresh):
+            yield fresh
         write_json(fresh / MANIFEST, {"format": FORMAT, **about, "files": sorted(_files(fresh))})
         if path.exists():
             os.replace(path, Path(scratch) / "old")

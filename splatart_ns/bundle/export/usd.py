@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 from pathlib import Path
 
@@ -20,12 +21,15 @@ STATIC_FRICTION, DYNAMIC_FRICTION = 0.8, 0.6
 
 def write_usd(robot: Robot, folder: Path) -> Path:
     """Write `<name>.usd`: metres, z up, the root fixed to the world; loops are left out of the articulation."""
-    from pxr import Usd
+    from pxr import Tf, Usd
 
     path = folder / f"{robot.name}.usd"
     stage = Usd.Stage.CreateNew(str(path))
     _Writer(stage, robot).write()
-    stage.Save()
+    try:
+        stage.Save()
+    except Tf.ErrorException as error:
+        raise OSError(errno.EIO, "usd-core could not save it", str(path)) from error
     return path
 
 

@@ -82,6 +82,14 @@ def test_a_usd_is_an_articulation_fixed_to_the_world(write):
     assert piece.HasAPI(pxr.CollisionAPI) and pxr.MeshCollisionAPI(piece).GetApproximationAttr().Get() == "convexHull"
 
 
+def test_a_usd_that_finds_no_room_is_named(write, tmp_path, small_files):
+    pytest.importorskip("pxr.UsdPhysics")
+    with pytest.raises(OSError, match="could not save") as error:
+        write("usd")
+    assert error.value.filename == str(tmp_path / "out/thing.usd")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_glb_has_a_node_per_part_and_says_how_it_moves(write):
     tree = glb_tree(write("glb"))
     nodes = {node["name"]: node for node in tree["nodes"]}
