@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -23,6 +24,9 @@ from splatart_ns.files import replacing
 from splatart_ns.splats.palette import part_colours
 
 Output = Literal["rgb", "depth", "accumulation", "parts"]
+_OTHER_FORMATS = {".png", ".apng", ".jpg", ".jpeg", ".webp", ".avif", ".bmp", ".tif", ".tiff", ".exr", ".svg", ".pdf"}
+_OTHER_FORMATS |= {".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".ogv", ".flv"}
+"""Of pictures and films; whoever names one expects no folder."""
 
 
 def render_frames(
@@ -71,21 +75,23 @@ def bundle_colours(bundle: Bundle) -> Tensor:
 
 
 def write_frames(frames: Iterable[np.ndarray], path: Path, fps: float = 30.0) -> int:
-    """Write frames [H, W, 3] RGB to `*.gif`, `*.mp4`, or, for a path without suffix, as PNGs into a folder.
+    """Write frames [H, W, 3] RGB to `*.gif`, `*.mp4`, or as PNGs into a folder, which other paths are.
 
     Files appear under their names when they are whole. PNGs are `frame_0000.png` and so on; those of an earlier,
     longer run are removed. Returns the number of frames.
+
+    Raises:
+        InputError: `path` is called as other pictures or films are, or ffmpeg fails.
     """
     path = Path(path)
-    match path.suffix.lower():
-        case ".gif":
-            return _write_gif(frames, path, fps)
-        case ".mp4":
-            return _write_mp4(frames, path, fps)
-        case "":
-            return _write_pngs(frames, path)
-        case suffix:
-            raise InputError(f"{path}: '{suffix}' cannot be written; give a .gif, an .mp4 or a folder")
+    suffix = "" if path.is_dir() else path.suffix.lower()
+    if suffix == ".gif":
+        return _write_gif(frames, path, fps)
+    if suffix == ".mp4":
+        return _write_mp4(frames, path, fps)
+    if suffix in _OTHER_FORMATS:
+        raise InputError(f"{path}: '{suffix}' cannot be written; give a .gif, an .mp4 or a folder")
+    return _write_pngs(frames, path)
 
 
 def _write_pngs(frames: Iterable[np.ndarray], folder: Path) -> int:
@@ -107,26 +113,50 @@ def _frame_name(number: int) -> str:
 
 def _write_gif(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
     images = [Image.fromarray(frame).quantize() for frame in frames]
+    # Browsers take less than two hundredths of a second for ten; the count has 16 bits.
+    hundredths = round(min(max(100 / fps, 2), 65535))
     with replacing(path) as temporary:
-        images[0].save(temporary, save_all=True, append_images=images[1:], duration=1000 / fps, loop=0)
+        images[0].save(temporary, save_all=True, append_images=images[1:], duration=10 * hundredths, loop=0)
     return len(images)
 
 
 def _write_mp4(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
     count, writer = 0, None
     with replacing(path) as temporary:
+        temporary.touch()  # where that cannot be, it says why
         try:
             for frame in frames:
                 # Video has one colour sample for 2 x 2 pixels.
                 height, width = frame.shape[:2]
                 frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-                if writer is None:
-                    size = frame.shape[1], frame.shape[0]
-                    writer = imageio_ffmpeg.write_frames(str(temporary), size, fps=fps, quality=8, macro_block_size=2)
-                    writer.send(None)
-                writer.send(np.ascontiguousarray(frame))
+                with _ffmpeg_at(path):
+                    if writer is None:
+                        writer = _film_writer(temporary, frame, fps)
+                    writer.send(np.ascontiguousarray(frame))
                 count += 1
         finally:
             if writer is not None:
                 writer.close()
+        with _ffmpeg_at(path):  # which fails in silence, too
+            written, _ = imageio_ffmpeg.count_frames_and_secs(str(temporary))
+            if written < count:
+                raise RuntimeError(f"{written} of {count} frames")
     return count
+
+
+def _film_writer(path: Path, frame: np.ndarray, fps: float) -> Generator[None, np.ndarray, None]:
+    """Takes frames like this one."""
+    size = frame.shape[1], frame.shape[0]
+    writer = imageio_ffmpeg.write_frames(str(path), size, fps=fps, quality=8, macro_block_size=2)
+    writer.send(None)
+    return writer
+
+
+@contextmanager
+def _ffmpeg_at(path: Path) -> Iterator[None]:
+    """Turn what imageio-ffmpeg raises into an `InputError`."""
+    try:
+        yield
+    except (OSError, RuntimeError, IndexError) as error:
+        mend = "check the space on the disk and the ffmpeg of imageio-ffmpeg, or give a .gif or a folder"
+        raise InputError(f"{path}: ffmpeg could not write it; {mend}") from error

@@ -49,7 +49,7 @@ class Render:
     frames: int = 60
     """Frames of each joint's sweep."""
     fps: float = 30.0
-    """Frames per second of a film."""
+    """Frames per second of a film. A GIF counts hundredths of a second and shows each frame for two or more."""
     resolution: int = 512
     """Pixels along each side."""
     azimuth: float | None = None

@@ -125,3 +125,36 @@ def test_a_run_that_dies_leaves_the_last_good_file(tmp_path):
 def test_other_formats_are_refused(tmp_path):
     with pytest.raises(InputError, match="'.avi' cannot be written"):
         write_frames(iter(FRAMES), tmp_path / "a.avi")
+
+
+@pytest.mark.parametrize("fps", [30, 60, 1000, 1e-9])
+def test_a_gif_keeps_to_durations_that_programs_show(tmp_path, fps):
+    write_frames(iter(FRAMES), tmp_path / "a.gif", fps)
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.info["duration"] == {30: 30, 60: 20, 1000: 20, 1e-9: 655350}[fps]
+
+
+@pytest.mark.parametrize("name", ["run_0.5", "a.GIF", "a.avi"])
+def test_a_folder_may_have_a_dot(tmp_path, name):
+    if name != "run_0.5":
+        (tmp_path / name).mkdir()
+    assert write_frames(iter(FRAMES), tmp_path / name) == 3
+    assert len(list((tmp_path / name).glob("frame_*.png"))) == 3
+
+
+def test_a_film_for_which_there_is_no_room_leaves_the_last_good_one(tmp_path, small_files):
+    (tmp_path / "a.mp4").write_bytes(b"good")
+    with pytest.raises(InputError, match="a.mp4: ffmpeg could not write it"):
+        write_frames(iter(FRAMES), tmp_path / "a.mp4")
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == {"a.mp4": b"good"}
+
+
+@pytest.mark.parametrize("program", ["/bin/false", "/nowhere"])
+def test_an_ffmpeg_that_does_not_work_is_told(tmp_path, monkeypatch, program):
+    from imageio_ffmpeg import _io
+
+    monkeypatch.setattr(_io, "get_first_available_h264_encoder", _io.get_first_available_h264_encoder.__wrapped__)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", program)
+    with pytest.raises(InputError, match="a.mp4: ffmpeg could not write it"):
+        write_frames(iter(FRAMES), tmp_path / "a.mp4")
+    assert list(tmp_path.iterdir()) == []
