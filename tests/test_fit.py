@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from splatart_ns.bundle import load_bundle
+from splatart_ns.bundle.export.folder import export_folder
 
 STAGES = ["semantic state_00", "semantic state_01", "pose", "joint"]
 RUNS = ["state_00/splatart-semantic", "state_01/splatart-semantic", "all/splatart-pose", "all/splatart-joint"]
@@ -224,3 +225,25 @@ class TestResuming:
         assert not again.resume(STAGES[1], whole=False)
         assert finished_stages(fit_copy) == STAGES[:1]
         assert not again.resume(STAGES[2], whole=True)
+
+    def test_what_describes_the_earlier_fit_goes_before_a_stage_runs_again(self, report, fit_copy, hinge_capture):
+        (fit_copy / "metrics.json").write_text("{}")
+        with export_folder(fit_copy / "export/ply", {}) as folder:
+            (folder / "bundle.ply").touch()
+        (fit_copy / "notes.txt").write_text("mine")
+        assert report(fit_copy, hinge_capture).resume(STAGES[0], whole=True)
+        assert (fit_copy / "metrics.json").exists()
+        assert not report(fit_copy, hinge_capture, seed=1).resume(STAGES[0], whole=True)
+        assert sorted(f.name for f in fit_copy.iterdir()) == ["notes.txt", "report.json", "runs"]
+
+    def test_a_folder_without_a_fit_keeps_its_files(self, report, hinge_capture, tmp_path):
+        (tmp_path / "parts").mkdir()
+        for name in ("parts/mine.ply", "metrics.json"):
+            (tmp_path / name).write_text("mine")
+        assert not report(tmp_path, hinge_capture).resume(STAGES[0], whole=True)
+        assert (tmp_path / "metrics.json").exists() and (tmp_path / "parts/mine.ply").exists()
+
+    def test_a_bundle_whose_report_was_removed_goes_too(self, report, fit_copy, hinge_capture):
+        (fit_copy / "report.json").unlink()
+        assert not report(fit_copy, hinge_capture).resume(STAGES[0], whole=True)
+        assert sorted(f.name for f in fit_copy.iterdir()) == ["report.json", "runs"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from splatart_ns.splats.splat import Splat
 
 FORMAT = "splatart-articulation-1"
 ARTICULATION = "articulation.json"
+METRICS = "metrics.json"
+"""What `splatart eval` writes beside it."""
 _VARIANCE = 1e300
 """Below which variances are: of what is hardly determined they are large."""
 
@@ -75,6 +78,14 @@ def save_bundle(bundle: Bundle, folder: Path) -> None:
     )
     for stale in set((folder / "parts").glob("*.ply")) - {folder / path for path in splats.values()}:
         stale.unlink()
+
+
+def remove_bundle(folder: Path) -> None:
+    """Remove what `save_bundle` has written into `folder`, and the metrics of it."""
+    for path in (folder / ARTICULATION, folder / METRICS, *(folder / "parts").glob("*.ply")):
+        path.unlink(missing_ok=True)
+    with suppress(OSError):  # other files are in it, or it is not there
+        (folder / "parts").rmdir()
 
 
 def _splat_paths(bundle: Bundle) -> dict[str, str]:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from splatart_ns.bundle.bundle import Bundle
-from splatart_ns.bundle.folder import ARTICULATION, load_bundle
+from splatart_ns.bundle.folder import ARTICULATION, METRICS, load_bundle
 from splatart_ns.bundle.posing import observed_motions
 from splatart_ns.capture.capture import Capture, State
 from splatart_ns.capture.formats import load_capture, load_novel
@@ -25,8 +25,6 @@ from splatart_ns.evaluation.parts import part_pose_errors
 from splatart_ns.evaluation.structure import structure_scores
 from splatart_ns.files import write_json
 from splatart_ns.records import read_record
-
-METRICS = "metrics.json"
 
 
 @torch.no_grad()

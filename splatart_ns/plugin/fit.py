@@ -20,6 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from splatart_ns.bundle import load_bundle
+from splatart_ns.bundle.folder import ARTICULATION, remove_bundle
 from splatart_ns.capture.capture import Capture, Worlds
 from splatart_ns.capture.check import require_valid
 from splatart_ns.capture.digest import capture_digest
@@ -142,7 +143,9 @@ class Report:
             self._last = time.perf_counter()
             return True
         self._earlier.clear()
-        self._write()  # before the stage's files change, lest a killed run leaves them with another run's report
+        # Before the stage's files change, lest a killed run leaves them with another run's results and report.
+        _remove_results(self.path)
+        self._write()
         return False
 
     def add(self, stage: str, outcome: Outcome) -> None:
@@ -155,6 +158,18 @@ class Report:
     def _write(self) -> None:
         self.data["seconds"] = round(sum(entry["wall_seconds"] for entry in self.data["stages"]), 2)
         write_json(self.path, self.data)
+
+
+def _remove_results(report: Path) -> None:
+    """Remove the bundle beside a report, where there is one or the other, and what was made of it."""
+    bundle = report.parent
+    if not report.exists() and not (bundle / ARTICULATION).exists():
+        return  # whatever lies there is no fit's
+    remove_bundle(bundle)
+    if (bundle / "export").is_dir():
+        from splatart_ns.bundle.export.folder import remove_exports  # which loads the libraries of all formats
+
+        remove_exports(bundle / "export")
 
 
 def fit(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from splatart_ns.errors import InputError
@@ -43,16 +43,34 @@ def check_folder(path: Path) -> None:
     """Raise InputError if `path` is a file, or holds what no earlier export wrote."""
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; give a folder for the export with --output")
-    present = _files(path) if path.is_dir() else set()
-    if not present:
+    if not (present := _files(path) if path.is_dir() else set()):
         return
-    ours = set()
-    if (path / MANIFEST).is_file():
-        record = read_record(path / MANIFEST, "give another folder with --output")
-        if record.text("format") == FORMAT:
-            ours = {MANIFEST, *(name for name in record.items("files") if isinstance(name, str))}
-    if foreign := sorted(present - ours):
-        raise InputError(f"{path}: holds '{foreign[0]}', which no export wrote; give another folder with --output")
+    if foreign := sorted(present - _written(path)):
+        inner = Path(foreign[0]).parts[0]
+        is_export = (path / inner / MANIFEST).is_file()
+        what = f"an export in its folder '{inner}'" if is_export else f"'{foreign[0]}', which no export wrote"
+        raise InputError(f"{path}: holds {what}; give another folder with --output")
+
+
+def remove_exports(path: Path) -> None:
+    """Remove the exports in folders of `path`; files of others stay, and so do exports whose manifest is damaged."""
+    for folder in {manifest.parent for manifest in path.glob(f"*/{MANIFEST}")}:
+        with suppress(InputError):
+            for name in _written(folder) & _files(folder):
+                (folder / name).unlink()
+    for folder, _, _ in os.walk(path, topdown=False):
+        with suppress(OSError):  # something is in it
+            os.rmdir(folder)
+
+
+def _written(folder: Path) -> set[str]:
+    """Names of the files that an export into `folder` wrote, by its manifest."""
+    if not (folder / MANIFEST).is_file():
+        return set()
+    record = read_record(folder / MANIFEST, "give another folder with --output")
+    if record.text("format") != FORMAT:
+        return set()
+    return {MANIFEST, *(name for name in record.items("files") if isinstance(name, str))}
 
 
 def _files(folder: Path) -> set[str]:

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from splatart_ns.bundle.export.folder import MANIFEST, export_folder
+from splatart_ns.bundle.export.folder import MANIFEST, export_folder, remove_exports
 from splatart_ns.errors import InputError
 
 
@@ -38,6 +38,29 @@ def test_a_file_that_was_added_to_an_export_is_named(tmp_path):
     (tmp_path / "out" / "mine.txt").touch()
     with pytest.raises(InputError, match="'mine.txt', which no export wrote; give another folder with --output"):
         write(tmp_path / "out", "b.txt")
+
+
+def test_exports_in_a_folder_are_told_from_files_of_others(tmp_path):
+    write(tmp_path / "out/glb", "a.glb")
+    with pytest.raises(InputError, match="holds an export in its folder 'glb'; give another folder"):
+        write(tmp_path / "out", "b.urdf")
+
+
+def test_exports_are_removed_and_files_of_others_are_not(tmp_path):
+    out = tmp_path / "export"
+    for form in ("urdf", "glb", "damaged"):
+        write(out / form, "a.txt", "meshes/a.obj")
+    (out / "damaged" / MANIFEST).write_text("{")
+    theirs = [out / "urdf/mine.txt", out / "notes.txt", tmp_path / "outside.txt"]
+    for file in theirs:
+        file.write_text("mine")
+    listed = json.loads((out / "urdf" / MANIFEST).read_text())
+    (out / "urdf" / MANIFEST).write_text(json.dumps({**listed, "files": ["a.txt", "../../outside.txt", "gone.txt"]}))
+    remove_exports(out)
+    left = {f.relative_to(tmp_path).as_posix() for f in tmp_path.rglob("*") if f.is_file()}
+    damaged = {f"export/damaged/{name}" for name in ("a.txt", "meshes/a.obj", MANIFEST)}
+    assert left == damaged | {f.relative_to(tmp_path).as_posix() for f in theirs} | {"export/urdf/meshes/a.obj"}
+    assert not (out / "glb").exists()
 
 
 def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
