@@ -291,6 +291,15 @@ def test_eval_needs_the_capture_of_the_bundle(refused, hinge_fit, capture):
     assert not (hinge_fit / "metrics.json").exists()
 
 
+@pytest.mark.parametrize("names", [["base", "wing"], ["lid", "base"]], ids=str)
+def test_eval_needs_the_parts_of_the_bundle(refused, bundle, capture, names):
+    for state in ("state_00", "state_01"):
+        edit(capture / state / "transforms.json", lambda t: t.update(semantic_classes=["background", *names]))
+    (bundle / "metrics.json").write_text("good")
+    assert f"{capture}: has other parts than " in refused("eval", bundle, "--data", capture)
+    assert (bundle / "metrics.json").read_text() == "good"
+
+
 def test_synth_refuses_what_it_cannot_read_or_write(refused, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full/file").write_text("mine")

@@ -121,10 +121,22 @@ def _frozen(robot: Robot, options: SynthesisOptions) -> dict[str, float]:
     return frozen
 
 
+def _unfrozen(text: str, robot: Robot, frozen: Mapping[str, float]) -> dict[str, float]:
+    """As `_assignments`, which must not contradict what is frozen."""
+    values = _assignments(text, robot)
+    for name in values.keys() & frozen.keys():
+        if values[name] != frozen[name]:
+            raise InputError(
+                f"{robot.path}: joint {name!r} is frozen at {frozen[name]:g} and given the value {values[name]:g}; "
+                "leave out one of them."
+            )
+    return values
+
+
 def _configurations(robot: Robot, frozen: Mapping[str, float], options: SynthesisOptions) -> list[dict[str, float]]:
     """The values of all movable joints, for each state."""
     if options.joint_values:
-        return [robot.complete({**_assignments(text, robot), **frozen}) for text in options.joint_values]
+        return [robot.complete({**_unfrozen(text, robot, frozen), **frozen}) for text in options.joint_values]
     free = [j for j in robot.movable if j.name not in frozen and j.mimic is None]
     rng = np.random.default_rng([options.seed, 0])
     columns = {j.name: _spread_values(j, robot, options.states, rng) for j in free}

@@ -41,6 +41,11 @@ def evaluate(bundle_folder: Path, capture_path: Path, device: torch.device | str
             f"{bundle_folder / ARTICULATION}: has {len(bundle.states)} states but {capture_path} has "
             f"{len(capture.states)}; evaluate a bundle on the capture that it was fitted to"
         )
+    if not {part.id: part.name for part in bundle.parts}.items() <= capture.parts.items():
+        raise InputError(
+            f"{capture_path}: has other parts than {bundle_folder / ARTICULATION}; evaluate a bundle on the capture "
+            "that it was fitted to"
+        )
     if "worlds" in bundle.provenance:
         capture = in_one_world(capture, bundle.provenance["worlds"])
     truth = load_ground_truth(capture_path)

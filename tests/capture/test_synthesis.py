@@ -196,6 +196,13 @@ def test_a_frozen_joint_joins_its_links(urdf, tmp_path):
     assert truth["source"]["frozen_joints"] == {"bend": 0.5, "roll": 1.0}
 
 
+def test_a_frozen_joint_is_given_no_other_value(urdf, tmp_path):
+    options = replace(SMALL, freeze=("bend=0.5",), joint_values=("bend=0.5,lift=0", "bend=0.2,lift=0.1"))
+    with pytest.raises(InputError, match="joint 'bend' is frozen at 0.5 and given the value 0.2; leave out one"):
+        synthesize(urdf, tmp_path / "new", options)
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
