@@ -246,6 +246,34 @@ def test_bad_options_of_render_are_refused(refused, hinge_fit, tmp_path, argumen
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
+        (["--data", "c", "--resolution", 64, "--azimuth", 0], "of its own; leave out --resolution and --azimuth."),
+        (["--data", "c", "--elevation", 0], "--data has cameras of its own; leave out --elevation."),
+        (["--camera", 3], "--data is not given; give it, or leave out --camera."),
+        (["--states", 3], "--dataset is not given; give it, or leave out --states."),
+        (["--views", "hemisphere", "--seed", 1], "give it, or leave out --views and --seed."),
+        (["--frames", 3], "--sweep is not given; give it, or leave out --frames."),
+        (["--dataset", 9, "--channel", "depth"], "--dataset chooses what it shows; leave out --channel."),
+        (["--dataset", 9, "--background", 0, 0, 0, "--azimuth", 0], "leave out --azimuth and --background."),
+        (["--dataset", 9, "--sweep", "--fps", 9], "leave out --sweep and --fps."),
+    ],
+    ids=str,
+)
+def test_options_that_would_change_nothing_are_refused(refused, hinge_fit, tmp_path, arguments, expected):
+    assert expected in refused("render", hinge_fit, "--output", tmp_path / "new", *arguments)
+    assert contents(tmp_path) == {}
+
+
+def test_a_joint_is_not_set_that_the_trajectory_moves(refused, hinge_fit, tmp_path):
+    (tmp_path / "q.csv").write_text("base_to_lid\n0\n1\n")
+    arguments = "--trajectory", tmp_path / "q.csv", "--set", "base_to_lid=1"
+    sentence = refused("render", hinge_fit, "--output", tmp_path / "new", *arguments)
+    assert "q.csv: moves 'base_to_lid', which --set holds; leave out one of them." in sentence
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
         (["--resolution", 10**8], "--resolution is 100000000; give 16384 or less"),
         (["--dataset", 10**12], "--dataset is 1000000000000; give at most 10000000 images"),
         (["--dataset", 10**7, "--states", 10**11], "--states is 100000000000; give 100000 or less"),

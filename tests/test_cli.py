@@ -211,8 +211,10 @@ def test_render_writes_an_mp4(render, tmp_path):
     assert [f.name for f in tmp_path.iterdir()] == ["sweep.mp4"]
 
 
-def test_render_looks_through_a_camera_of_the_capture(render, hinge_capture, tmp_path):
-    shown = picture(render(tmp_path / "frames", "--data", hinge_capture, "--camera", 12) / "frame_0000.png")
+def test_render_looks_through_a_camera_of_the_capture(run_main, hinge_fit, hinge_capture, tmp_path):
+    arguments = "--data", hinge_capture, "--camera", 12
+    assert run_main("render", hinge_fit, "--output", tmp_path / "frames", *arguments)[0] == 0
+    shown = picture(tmp_path / "frames/frame_0000.png")
     rgba = np.asarray(Image.open(hinge_capture / "state_00/images/0012.png"), dtype=float)
     alpha = rgba[..., 3:] / 255
     true = alpha * rgba[..., :3] + (1 - alpha) * 255
@@ -232,7 +234,11 @@ def test_a_dataset_is_a_capture_without_problems(run_main, hinge_fit, tmp_path):
 def test_a_dataset_chooses_its_own_configurations(run_main, hinge_fit, tmp_path):
     arguments = "--dataset", 9, "--output", tmp_path / "capture"
     code, _, errors = run_main("render", hinge_fit, *arguments, "--set", f"{JOINT}=0.1")
-    assert code == 2 and "leave out --configuration, --set," in errors and not (tmp_path / "capture").exists()
+    assert (
+        code == 2
+        and "--dataset chooses what it shows; leave out --set." in errors
+        and not (tmp_path / "capture").exists()
+    )
 
 
 @pytest.mark.parametrize("channel", ["depth", "accumulation", "parts"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -34,7 +34,7 @@ class Render:
     sweep: bool = False
     """Move one joint after the other over its observed range."""
     trajectory: Path | None = None
-    """CSV file: a header of joint names, and a row of values a frame."""
+    """CSV file: a header of joint names, and a row of values a frame; --set holds other joints."""
     dataset: int | None = None
     """Write a capture with ground truth: so many images with part labels and depth at random views and configurations.
     Run it again to go on, or with more to add some."""
@@ -51,7 +51,7 @@ class Render:
     fps: float = 30.0
     """Frames per second of a film. A GIF counts hundredths of a second and shows each frame for two or more."""
     resolution: int = 512
-    """Pixels along each side."""
+    """Pixels along each side, without --data."""
     azimuth: float | None = None
     """Degrees of the camera about z; by default it faces the moving parts."""
     elevation: float = 25.0
@@ -71,6 +71,7 @@ class Render:
         if self.sweep and self.trajectory is not None:
             raise InputError("--sweep and --trajectory are both given; choose one.")
         self._check_numbers()
+        self._check_all_count()
         choose_rasterizer(self.rasterizer)
         splat = load(self.bundle)
         if self.dataset is not None:
@@ -94,13 +95,26 @@ class Render:
             if is_wrong:
                 raise InputError(f"--{name} is {getattr(self, name)}; give {mend}.")
 
+    def _check_all_count(self) -> None:
+        """Refuse options that would change nothing."""
+        shown = ("configuration", "set", "sweep", "trajectory", "data", "channel", "azimuth", "elevation", "background")
+        unused = (
+            (self.dataset is not None, "--dataset chooses what it shows;", (*shown, "fps")),
+            (self.dataset is None, "--dataset is not given; give it, or", ("states", "views", "seed")),
+            (self.data is not None, "--data has cameras of its own;", ("resolution", "azimuth", "elevation")),
+            (self.data is None, "--data is not given; give it, or", ("camera",)),
+            (not self.sweep, "--sweep is not given; give it, or", ("frames",)),
+        )
+        defaults = {field.name: field.default for field in fields(self)}
+        for applies, why, names in unused:
+            given = [f"--{name}" for name in names if getattr(self, name) != defaults[name]]
+            if applies and given:
+                raise InputError(f"{why} leave out {' and '.join(given)}.")
+
     def _write_dataset(self, splat: ArticulatedSplat) -> None:
         from splatart_ns.bundle.dataset import Dataset, DatasetOptions
         from splatart_ns.bundle.dataset_capture import write_dataset
 
-        if self.set or self.sweep or not (self.configuration is self.trajectory is self.data is None):
-            rivals = "--configuration, --set, --sweep, --trajectory and --data"
-            raise InputError(f"--dataset chooses what it shows; leave out {rivals}.")
         samples = Dataset(splat, DatasetOptions(self.states, self.resolution, self.views, self.seed))
         told = write_dataset(samples, self.output, self.dataset, lambda left: track(left, "Images", console=CONSOLE))
         if not told:
@@ -115,9 +129,13 @@ class Render:
         bundle, base = splat.bundle, {}
         if self.configuration is not None:
             base = configurations.read_configuration(self.configuration, bundle)
-        base |= configurations.parse_settings(sum(self.set, ()), bundle)
+        held = configurations.parse_settings(sum(self.set, ()), bundle)
+        base |= held
         if self.trajectory is not None:
-            path = [base | q for q in configurations.read_trajectory(self.trajectory, bundle)]
+            rows = configurations.read_trajectory(self.trajectory, bundle)
+            if both := held.keys() & rows[0].keys():
+                raise InputError(f"{self.trajectory}: moves '{min(both)}', which --set holds; leave out one of them.")
+            path = [base | q for q in rows]
         else:
             path = configurations.sweep(bundle, base, self.frames) if self.sweep else [base]
         if self.data is not None:
