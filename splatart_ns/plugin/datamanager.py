@@ -41,6 +41,14 @@ class CaptureDataset(InputDataset):
         with ThreadPoolExecutor() as pool:
             return list(pool.map(self.get_view, range(len(self))))
 
+    def __getitem__(self, image_idx: int) -> dict[str, Any]:
+        """As `get_data`, with the image over white, as renders are, for who shows it: ns-render and the viewer."""
+        data = self.get_data(image_idx)
+        rgb, alpha = data["image"][..., :3], data["image"][..., 3:]
+        if alpha.shape[-1] == 1:
+            data["image"] = rgb * alpha + 1 - alpha
+        return data
+
     def get_data(self, image_idx: int, image_type: str = "float32") -> dict[str, Any]:
         """image [H, W, 3 or 4] (the silhouette as alpha, where there is one), semantics [H, W, 1], mask [H, W, 1]."""
         view = self.views[image_idx] if "views" in self.__dict__ else self.get_view(image_idx)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from nerfstudio.utils.colormaps import apply_colormap
 
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.view import View
@@ -35,6 +36,17 @@ def test_batches_have_alpha_and_labels_and_frames_without_labels_say_so(capture_
             assert (image[..., 3:][labels > 0] > 0).float().mean() > 0.95
     assert labelled == {i for i, frame in enumerate(frames) if frame.labels is not None}
     assert 0 < len(labelled) < len(frames)
+
+
+def test_images_to_show_are_over_white_as_renders_are(capture_dir: Path, opaque_capture_dir: Path) -> None:
+    dataset = manage(capture_dir, test_mode="test").eval_dataset
+    batch = dataset.get_data(0)
+    shown, alpha = dataset[0], batch["image"][..., 3:]
+    assert shown.keys() == batch.keys()
+    assert torch.allclose(shown["image"], batch["image"][..., :3] * alpha + 1 - alpha)
+    assert torch.equal(apply_colormap(shown["image"]), shown["image"])  # what ns-render does with `gt-rgb`
+    opaque = manage(opaque_capture_dir).train_dataset
+    assert torch.equal(opaque[0]["image"], opaque.get_data(0)["image"])
 
 
 def test_opaque_images_start_from_points_on_the_object_and_on_what_surrounds_it(opaque_capture_dir: Path) -> None:
