@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -42,12 +43,20 @@ def start_splatart() -> Callable[..., subprocess.Popen]:
 
 
 @pytest.fixture
-def small_files() -> Iterator[None]:
-    """Lets files of this process grow to 1000 bytes only, as if the disk were full."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+def small_files() -> Callable[[], AbstractContextManager]:
+    """While a block lasts, files of this process grow to 1000 bytes only, as if the disk were full: not until the test
+    ends, for pytest's own output may go to a file."""
+
+    @contextmanager
+    def limit() -> Iterator[None]:
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limit
 
 
 @pytest.fixture

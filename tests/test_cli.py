@@ -87,7 +87,8 @@ def test_output_that_finds_no_room_ends_the_command_with_a_sentence(start_splata
 
 
 def test_pictures_that_find_no_room_are_named_and_gone(run_main, hinge_fit, tmp_path, small_files):
-    code, _, errors = run_main("render", hinge_fit, "--output", tmp_path / "a.gif", *SMALL)
+    with small_files():
+        code, _, errors = run_main("render", hinge_fit, "--output", tmp_path / "a.gif", *SMALL)
     assert code == 2 and f"{tmp_path / 'a.gif'}: cannot be read or written (File too large)" in errors
     assert list(tmp_path.iterdir()) == []
 

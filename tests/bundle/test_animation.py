@@ -144,7 +144,7 @@ def test_a_folder_may_have_a_dot(tmp_path, name):
 
 def test_a_film_for_which_there_is_no_room_leaves_the_last_good_one(tmp_path, small_files):
     (tmp_path / "a.mp4").write_bytes(b"good")
-    with pytest.raises(InputError, match="a.mp4: ffmpeg could not write it"):
+    with pytest.raises(InputError, match="a.mp4: ffmpeg could not write it"), small_files():
         write_frames(iter(FRAMES), tmp_path / "a.mp4")
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == {"a.mp4": b"good"}
 

@@ -18,12 +18,12 @@ from splatart_ns.plugin.fit import Report, Settings, _semantic_config, _train
 from splatart_ns.plugin.stage_run import num_processes, run_side_by_side, run_stage
 
 
-def test_a_checkpoint_that_finds_no_room_is_refused_in_one_sentence(configs, monkeypatch, request):
+def test_a_checkpoint_that_finds_no_room_is_refused_in_one_sentence(configs, monkeypatch, small_files):
     from nerfstudio.engine.trainer import Trainer
 
     def train(trainer):
-        request.getfixturevalue("small_files")
-        trainer.save_checkpoint(0)
+        with small_files():
+            trainer.save_checkpoint(0)
 
     monkeypatch.setattr(Trainer, "train", train)
     with pytest.raises(InputError, match="nerfstudio_models: cannot be written .*checkpoint"):

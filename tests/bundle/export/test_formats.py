@@ -84,7 +84,7 @@ def test_a_usd_is_an_articulation_fixed_to_the_world(write):
 
 def test_a_usd_that_finds_no_room_is_named(write, tmp_path, small_files):
     pytest.importorskip("pxr.UsdPhysics")
-    with pytest.raises(OSError, match="could not save") as error:
+    with pytest.raises(OSError, match="could not save") as error, small_files():
         write("usd")
     assert error.value.filename == str(tmp_path / "out/thing.usd")
     assert list(tmp_path.iterdir()) == []
