@@ -170,6 +170,7 @@ class PosePipeline(VanillaPipeline):
             self._bring_together(splats, capture)
         S, P = len(splats), self.model.num_parts
         self._reference, self._known, self._frozen = [0] * P, torch.ones(S, P, dtype=torch.bool), torch.zeros(S, P) > 0
+        self._maybe_moved = torch.zeros(S, P) > 0
         self.model.start(splats, self._initial_poses(splats), self._frozen)
         self._pairs = self._shuffled_pairs()
         self._own = self._shuffled_views()
@@ -226,21 +227,29 @@ class PosePipeline(VanillaPipeline):
                 M[s, p] = motion.T.cpu()
                 self._known[s, p] = motion.found
                 self._frozen[s, p] = not motion.found or (snap and motion.still)
-                self.model.alike[p] |= motion.doubtful
-                self._note_doubt(p, s, motion)
+                self._maybe_moved[s, p] = motion.maybe_moved
+                self.model.alike[p] |= len(motion.alike) > 0
+                self._note_alike(p, s, motion)
         return since_state_0(M, self._known)
 
-    def _note_doubt(self, p: int, s: int, motion: InitialMotion) -> None:
-        """Say by which other turns the images show a part as well, or that it may not rest."""
-        if not motion.doubtful:
-            return
-        if motion.fits_better is None:
+    def _note_alike(self, p: int, s: int, motion: InitialMotion) -> None:
+        """Say by which other turns the images show a part as well."""
+        if motion.alike:
             turn, *others = (f"{math.degrees(so3_log(T[:3, :3]).norm()):.0f}" for T in (motion.T, *motion.alike))
-            doubt = f"turned by {turn} degrees; by {' or '.join(others)} it looks nearly the same."
-        else:
-            doubt = "seems to rest, but other motions fit its images a little better; it may have moved."
-        self.notes.append(f"part {self.model.part_names[p + 1]}, state {s}: {doubt}")
-        CONSOLE.log(self.notes[-1], markup=False)
+            part = f"part {self.model.part_names[p + 1]}, state {s}"
+            self.notes.append(f"{part}: turned by {turn} degrees; by {' or '.join(others)} it looks nearly the same.")
+            CONSOLE.log(self.notes[-1], markup=False)
+
+    def _note_resting(self, held: Tensor, T: Tensor, covariance: Tensor) -> None:
+        """Say of which parts it is in doubt whether they rest, and mark them for `doubted`: of those that refinement
+        left as they were, from `held` to T [S, P, 4, 4], and whose covariances [S, P, 6, 6] leave no turn open."""
+        stayed = torch.isclose(T, held).flatten(2).all(-1) & ~may_have_turned(covariance)
+        doubtful = self._maybe_moved & stayed.cpu()
+        self.model.alike |= doubtful.any(0).to(self.model.alike)
+        for s, p in doubtful.nonzero().tolist():
+            part = f"part {self.model.part_names[p + 1]}, state {s}"
+            self.notes.append(f"{part}: seems to rest, but other motions fit its images a little better.")
+            CONSOLE.log(self.notes[-1], markup=False)
 
     def _note_unknown(self, known: Tensor) -> None:
         """Say which poses [S, P] of a part no image tells."""
@@ -370,10 +379,11 @@ class PosePipeline(VanillaPipeline):
         model = self.model
         splats = [model.state_splat(s).detach() for s in range(model.num_states)]
         as_begun = model.config.learn_gaussians == "after"
+        begun = model.poses.T()
         T, model.covariance, model.held_ratio = refine_known_poses(
             splats,
             self.views,
-            model.poses.T(),
+            begun,
             self._frozen,
             self._reference,
             self._known,
@@ -385,6 +395,7 @@ class PosePipeline(VanillaPipeline):
         known = model.covariance.isfinite().flatten(2).all(-1)
         self._note_unknown(known)
         self._note_turned(model.covariance)
+        self._note_resting(begun, T, model.covariance)
         merged = Splat.cat(merge_parts(splats, self.views, T, known, self._seen if as_begun else None))
         params = gauss_params_from_splat(merged)
         for name, parameter in params.items():

@@ -21,7 +21,7 @@ from splatart_ns.errors import DISK_ERRORS, InputError
 from splatart_ns.machine import num_cores
 from splatart_ns.plugin.companion import Companion, Companions, Outcome
 from splatart_ns.plugin.compat import seed_everything, stop_event_writers
-from splatart_ns.rasterize.rasterization import Backend
+from splatart_ns.rasterize.rasterization import Backend, default_device
 from splatart_ns.threads import kernel_threads
 
 
@@ -29,7 +29,7 @@ def run_stage(config: TrainerConfig, on_step: Callable[[int], None]) -> Outcome:
     """Train a stage; `on_step` gets the number of finished steps."""
     seed_everything(config.machine.seed)
     start = time.perf_counter()
-    if torch.cuda.is_available():
+    if default_device() == "cuda":
         torch.cuda.reset_peak_memory_stats()
     config.save_config()
     trainer: Trainer = config.setup(local_rank=0, world_size=1)
@@ -66,7 +66,7 @@ def _saving(folder: Path) -> Iterator[None]:
 
 def num_processes(runs: int) -> int:
     """How many runs to train side by side: one thread a run is faster than many threads a run, one after the other."""
-    return 1 if torch.cuda.is_available() else max(1, min(runs, num_cores()))
+    return 1 if default_device() == "cuda" else max(1, min(runs, num_cores()))
 
 
 def run_side_by_side(
@@ -132,7 +132,7 @@ def run_side_by_side(
 
 def _peak_memory_mb() -> int:
     """Of the GPU in this stage where there is one, else of this process so far."""
-    if torch.cuda.is_available():
+    if default_device() == "cuda":
         return torch.cuda.max_memory_allocated() // 2**20
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak // (2**20 if sys.platform == "darwin" else 2**10)

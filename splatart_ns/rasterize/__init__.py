@@ -1,20 +1,6 @@
 """Gaussians to pixels: one entry, with backends for CUDA (gsplat), CPU (numba) and any device (torch)."""
 
-from splatart_ns.rasterize.rasterization import (
-    default_backend,
-    default_device,
-    rasterization,
-    rasterize_neighbours,
-    set_backend,
-)
+from splatart_ns.rasterize.rasterization import default_backend, rasterization, rasterize_neighbours, set_backend
 from splatart_ns.rasterize.render import Rendering, render
 
-__all__ = [
-    "Rendering",
-    "default_backend",
-    "default_device",
-    "rasterization",
-    "rasterize_neighbours",
-    "render",
-    "set_backend",
-]
+__all__ = ["Rendering", "default_backend", "rasterization", "rasterize_neighbours", "render", "set_backend"]

@@ -88,13 +88,8 @@ class InitialMotion:
     """Cost of no motion over the best cost."""
     alike: tuple[Tensor, ...] = ()
     """Motions [4, 4] that turn the part quite otherwise and render as well, the best first."""
-    fits_better: Tensor | None = None
-    """A motion [4, 4] that fits a still part somewhat better, if it is in doubt whether that did not move."""
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether the part may have moved otherwise."""
-        return self.fits_better is not None or len(self.alike) > 0
+    maybe_moved: bool = False
+    """Whether another motion fits a still part somewhat better."""
 
 
 def initial_motion(
@@ -154,7 +149,7 @@ def initial_motion(
     best = ends[order[0]]
     identity_ratio = identity_cost / max(best.cost, 1e-12)
     still = identity_ratio < STILL_RATIO
-    fits_better = best.T if still and identity_ratio > RESTS_RATIO else None
+    maybe_moved = still and identity_ratio > RESTS_RATIO
     if not still and identity_ratio < SHADED_RATIO and so3_log(best.T[:3, :3]).norm() > OTHERWISE / 2:
         even = part_pair(splats, views, part, DOUBTFUL_VIEWS, FINE_PIXELS)
         stayed, turned = replace(even, **IN_EVEN_LIGHT).cost(torch.stack([identity, best.T])).tolist()
@@ -167,7 +162,7 @@ def initial_motion(
         cost=best.cost,
         identity_ratio=identity_ratio,
         alike=alike,
-        fits_better=fits_better,
+        maybe_moved=maybe_moved,
     )
 
 

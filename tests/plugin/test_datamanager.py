@@ -3,8 +3,10 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+import trimesh
 from nerfstudio.utils.colormaps import apply_colormap
 
 from splatart_ns.capture.formats import load_capture
@@ -57,6 +59,21 @@ def test_opaque_images_start_from_points_on_the_object_and_on_what_surrounds_it(
     inside = carve(labelled, xyz, dilate=2)
     assert inside[:-100].float().mean() > 0.95 and inside[-100:].float().mean() < 0.5
     assert inside[:-100].sum() >= 100
+
+
+@pytest.mark.parametrize("with_hull", [True, False])
+def test_points_of_ones_own_are_kept_where_silhouettes_tell_nothing(
+    opaque_capture_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, with_hull: bool
+) -> None:
+    capture = shutil.copytree(opaque_capture_dir, tmp_path / "capture")
+    places, colours = np.eye(7, 3), np.zeros((7, 3), np.uint8)
+    trimesh.PointCloud(places, colours).export(capture / "state_01/cloud.ply")
+    file = capture / "state_01/transforms.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"ply_file_path": "cloud.ply"}))
+    if not with_hull:
+        monkeypatch.setattr("splatart_ns.plugin.datamanager.visual_hull", lambda *_: None)
+    points = manage(capture, seed_gaussians=50).train_dataparser_outputs.metadata["points3D_xyz"]
+    assert len(points) > 50 if with_hull else len(points) == 7
 
 
 def test_one_labelled_opaque_image_says_where_the_object_may_be(opaque_capture_dir: Path, tmp_path: Path) -> None:

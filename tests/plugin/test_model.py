@@ -11,7 +11,7 @@ from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 
 from splatart_ns.errors import InputError
-from splatart_ns.plugin.model import SplatartModel
+from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.splats.palette import part_colours
 
 GEOMETRY = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
@@ -34,6 +34,13 @@ def iterate(trainer: Trainer, step: int) -> tuple:
 
 def parameters(model: SplatartModel) -> dict[str, torch.Tensor]:
     return {name: p.detach().clone() for name, p in model.gauss_params.items()}
+
+
+def test_a_rasterizer_for_the_cpu_is_refused_on_a_gpu(monkeypatch) -> None:
+    monkeypatch.setattr("splatart_ns.plugin.model.set_backend", lambda _: None)
+    config = SplatartModelConfig(rasterizer="numba")
+    with pytest.raises(InputError, match="--machine.device-type cpu"):
+        config.setup(scene_box=None, num_train_data=1, metadata={}, device="cuda")
 
 
 def test_nothing_is_asked_of_the_network(semantic_trainer, capture_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ from nerfstudio.engine.trainer import Trainer
 
 from splatart_ns.capture.check import require_valid
 from splatart_ns.errors import InputError
+from splatart_ns.geometry.se3 import se3_exp
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.plugin.pose import RATES
 from splatart_ns.stages.render_choice import InitialMotion
@@ -243,6 +244,24 @@ def test_a_part_that_may_have_turned_unseen_is_noted(pose_trainer):
     pipeline._note_turned(covariance)
     (note,) = pipeline.notes
     assert note.startswith("part lid, state 1: ") and "about its own axis" in note
+
+
+@pytest.mark.parametrize("then", ["stays", "is turned", "may have turned"])
+def test_a_part_that_only_seems_to_rest_is_in_doubt_unless_more_is_found_of_it(pose_trainer, monkeypatch, then):
+    rests = InitialMotion(torch.eye(4).double(), found=True, still=True, maybe_moved=True)
+    monkeypatch.setattr(
+        "splatart_ns.plugin.pose.initial_motion", lambda *pair: replace(rests, maybe_moved=pair[3] == 2)
+    )
+    pipeline = pose_trainer().pipeline
+    held, covariance = pipeline.model.poses.T().detach(), torch.zeros_like(pipeline.model.covariance)
+    T = held.clone()
+    if then == "is turned":
+        T[1, 1] = se3_exp(torch.tensor([0, 0, 0, 0, 0, 0.5]).double())
+    elif then == "may have turned":
+        covariance[1, 1, 5, 5] = 3.3
+    pipeline._note_resting(held, T, covariance)
+    assert pipeline.model.alike.tolist() == [False, then == "stays"]
+    assert [note[:18] for note in pipeline.notes] == ["part lid, state 1:"] * (then == "stays")
 
 
 def test_a_run_that_would_never_merge_is_refused(pose_trainer):

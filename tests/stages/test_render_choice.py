@@ -136,7 +136,7 @@ def test_of_a_square_plate_painted_on_half_of_one_side_the_right_turn_is_found(m
 
 def test_a_still_part_does_not_move_at_all(scene):
     found = initial_motion(*scene, part=1)
-    assert found.still and not found.doubtful
+    assert found.still and not found.maybe_moved
     assert torch.equal(found.T, torch.eye(4, dtype=torch.float64))
 
 
@@ -157,7 +157,7 @@ def test_that_a_part_rests_is_in_doubt_where_another_motion_fits_a_little_better
     T = motion((0, 0, 0), (slid, 0.0, 0.0))
     found = initial_motion(*blotched_plate(T, lambda x, _: 0.3 * torch.ones(3)), part=1)
     assert found.still and torch.equal(found.T, torch.eye(4, dtype=torch.float64))
-    assert found.doubtful == (slid > 0)
+    assert found.maybe_moved == (slid > 0)
 
 
 def test_a_square_part_that_others_shade_elsewhere_has_not_turned():
