@@ -23,7 +23,7 @@ from splatart_ns.bundle.motion_file import read_motions
 from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.view import View
 from splatart_ns.errors import InputError
-from splatart_ns.geometry.se3 import so3_log
+from splatart_ns.geometry.se3 import inverse, so3_log
 from splatart_ns.plugin.gaussians import gauss_params_from_splat
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.plugin.semantic_run import find_semantic_runs, read_state
@@ -36,6 +36,7 @@ from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_exte
 from splatart_ns.stages.reference import is_sure, reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import InitialMotion, initial_motion
 from splatart_ns.stages.siblings import slid_alike, slide_ways
+from splatart_ns.stages.symmetry import UNTURNED
 from splatart_ns.stages.thinning import BUDGET, MAX_VIEWS, ROUNDS, absences, expendable
 from splatart_ns.stages.unseen import may_have_turned
 from splatart_ns.stages.visibility import HIDDEN, looked_at
@@ -241,9 +242,14 @@ class PosePipeline(VanillaPipeline):
             CONSOLE.log(self.notes[-1], markup=False)
 
     def _note_resting(self, held: Tensor, T: Tensor, covariance: Tensor) -> None:
-        """Say of which parts it is in doubt whether they rest, and mark them for `doubted`: of those that refinement
-        left as they were, from `held` to T [S, P, 4, 4], and whose covariances [S, P, 6, 6] leave no turn open."""
-        stayed = torch.isclose(T, held).flatten(2).all(-1) & ~may_have_turned(covariance)
+        """Say of which parts it is in doubt whether they rest, and mark them for `doubted`.
+
+        Of those that refinement has neither turned nor slid, from poses `held` to T [S, P, 4, 4], and whose covariances
+        [S, P, 6, 6] leave no turn open.
+        """
+        turned = so3_log((inverse(held) @ T)[..., :3, :3]).norm(dim=-1) > math.radians(UNTURNED)
+        slid = self._frozen.to(T.device) & ~torch.isclose(T, held).flatten(2).all(-1)
+        stayed = ~(turned | slid | may_have_turned(covariance))
         doubtful = self._maybe_moved & stayed.cpu()
         self.model.alike |= doubtful.any(0).to(self.model.alike)
         for s, p in doubtful.nonzero().tolist():

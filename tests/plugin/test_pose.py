@@ -246,7 +246,7 @@ def test_a_part_that_may_have_turned_unseen_is_noted(pose_trainer):
     assert note.startswith("part lid, state 1: ") and "about its own axis" in note
 
 
-@pytest.mark.parametrize("then", ["stays", "is turned", "may have turned"])
+@pytest.mark.parametrize("then", ["stays", "is turned", "is slid", "may have turned"])
 def test_a_part_that_only_seems_to_rest_is_in_doubt_unless_more_is_found_of_it(pose_trainer, monkeypatch, then):
     rests = InitialMotion(torch.eye(4).double(), found=True, still=True, maybe_moved=True)
     monkeypatch.setattr(
@@ -257,6 +257,8 @@ def test_a_part_that_only_seems_to_rest_is_in_doubt_unless_more_is_found_of_it(p
     T = held.clone()
     if then == "is turned":
         T[1, 1] = se3_exp(torch.tensor([0, 0, 0, 0, 0, 0.5]).double())
+    elif then == "is slid":
+        T[1, 1, 0, 3] = 0.01
     elif then == "may have turned":
         covariance[1, 1, 5, 5] = 3.3
     pipeline._note_resting(held, T, covariance)

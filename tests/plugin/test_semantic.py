@@ -1,3 +1,4 @@
+import copy
 import json
 import shutil
 
@@ -7,6 +8,7 @@ import pytest
 import torch
 
 from splatart_ns.plugin.semantic_run import learned_views
+from splatart_ns.stages.camera_refinement import PASSES
 
 
 def test_growth_stops_at_the_limit(capture_dir, semantic_trainer):
@@ -134,3 +136,14 @@ def test_frames_of_different_exposures_are_evened_also_for_the_next_stage(captur
     checkpoint = {f"_model.{name}": getattr(pipeline.model, name) for name in ("viewmats", "gains", "trusted")}
     for view, kept in zip(learned_views(pipeline.datamanager.capture, 0, checkpoint), pipeline._views, strict=True):
         assert int((view.rgb.int() - kept.rgb.int()).abs().max()) <= 3  # which was rounded after every time
+
+
+def test_refined_cameras_stay_after_an_evaluation_which_loads_images_again(capture_dir, semantic_trainer):
+    pipeline = semantic_trainer(capture_dir, steps=301, semantic_start=300).pipeline
+    assert pipeline.datamanager.cached_train  # is loaded, and the cameras with it
+    pipeline.datamanager.train_cameras = copy.deepcopy(pipeline.datamanager.train_cameras)  # as on a GPU
+    given = pipeline.datamanager.train_dataset.cameras.camera_to_worlds.clone()
+    pipeline._refine_cameras(round(PASSES[0].at * 300))
+    refined = pipeline.datamanager.train_cameras.camera_to_worlds
+    assert not torch.equal(refined, given)
+    assert torch.equal(pipeline.datamanager.train_dataset.cameras.camera_to_worlds, refined)
