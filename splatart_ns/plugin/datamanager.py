@@ -15,7 +15,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from splatart_ns.capture.capture import UNLABELLED, Capture
 from splatart_ns.capture.seen_surface import SeenSurface, measured_surface
 from splatart_ns.capture.view import View, Window, load_points, load_view
-from splatart_ns.stages.hull import SeedPoints, seed_points, seen_surface, slack, visual_hull
+from splatart_ns.stages.hull import EXACT, SeedPoints, seed_points, seen_surface, slack, visual_hull
 from splatart_ns.stages.silhouette import with_silhouette
 from splatart_ns.stages.surroundings import surrounding_points
 
@@ -84,8 +84,8 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
 
     def __init__(self, config: SplatartDatamanagerConfig, *args, test_mode: str = "val", **kwargs):
         super().__init__(config, *args, test_mode=test_mode, **kwargs)
-        self.slack = 0
-        """By how many pixels the silhouettes contradict each other (see `stages.hull.slack`)."""
+        self.slack = EXACT
+        """By how much the silhouettes contradict each other."""
         if config.seed_gaussians > 0 and test_mode == "val":  # otherwise a checkpoint brings the Gaussians
             self._add_seed_points()
 

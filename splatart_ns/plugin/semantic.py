@@ -21,7 +21,7 @@ from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.rasterize.ssim import l1_ssim_loss
 from splatart_ns.stages.camera_refinement import PASSES, camera_change, refine_cameras
 from splatart_ns.stages.exposure import at_gain, frame_gains
-from splatart_ns.stages.hull import carve, slack
+from splatart_ns.stages.hull import Slack, carve, slack
 from splatart_ns.stages.semantic import (
     accumulation_loss,
     ballots,
@@ -163,9 +163,9 @@ class SemanticModel(SplatartModel):
             self.strategy.grow_grad2d = max(self.strategy.grow_grad2d, float(need.topk(room + 1).values[-1]))
 
     @torch.no_grad()
-    def fade_outside(self, views: list[View], slack: int) -> None:
+    def fade_outside(self, views: list[View], slack: Slack) -> None:
         """Make Gaussians with their centre outside a silhouette, or seen by no view, transparent: they get pruned."""
-        outside = ~carve(views, self.means.cpu(), dilate=2 + slack).to(self.device)
+        outside = ~carve(views, self.means.cpu(), 2 + slack.pixels, slack.views).to(self.device)
         self.gauss_params["opacities"][outside] = -10.0
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
@@ -219,12 +219,12 @@ class SemanticPipeline(VanillaPipeline):
         self.findings: dict[str, Any] = {}
         self._slack = self.datamanager.slack
         wanted = self.model.config.refine_cameras
-        self._refines = wanted == "on" or (wanted == "auto" and self._slack > 0)
-        if self._slack > 0 and not self._refines:
+        self._refines = wanted == "on" or (wanted == "auto" and self._slack.pixels > 0)
+        if self._slack.pixels > 0 and not self._refines:
             state = self.datamanager.capture.states[self.datamanager.dataparser.config.state].name
             self.notes.append(
-                f"{state}: the silhouettes contradict each other by {self._slack} pixels, so cameras or masks are not "
-                "exact; --refine-cameras off leaves them so."
+                f"{state}: the silhouettes contradict each other by {self._slack.pixels} pixels, so cameras or masks "
+                "are not exact; --refine-cameras off leaves them so."
             )
         dataset = self.datamanager.train_dataset
         self._labelled = {i for i, frame in enumerate(dataset.metadata["frames"]) if frame.labels is not None}
@@ -298,15 +298,17 @@ class SemanticPipeline(VanillaPipeline):
         # The datamanager takes a copy of its dataset's whenever it loads images, those of an evaluation, too.
         for cameras in (self.datamanager.train_cameras, self.datamanager.train_dataset.cameras):
             cameras.camera_to_worlds.copy_(poses[:, :3].to(cameras.camera_to_worlds))
-        self._slack = slack(self._views)[0] if self._slack else 0
+        if self._slack.pixels > 0:
+            self._slack = slack(self._views)[0]
         if due[-1] is PASSES[-1]:
             change = camera_change(model.viewmats, self._given)
-            self.findings["cameras"] = {**asdict(change), "slack_pixels": [self.datamanager.slack, self._slack]}
+            before, now = self.datamanager.slack.pixels, self._slack.pixels
+            self.findings["cameras"] = {**asdict(change), "slack_pixels": [before, now]}
             state = self.datamanager.capture.states[self.datamanager.dataparser.config.state].name
             self.notes.append(
-                f"{state}: the cameras contradicted each other by {self.datamanager.slack} pixels; they were turned by "
+                f"{state}: the cameras contradicted each other by {before} pixels; they were turned by "
                 f"{change.degrees:.2f} deg and moved by {change.percent:.2f} % of their distance, and now do so by "
-                f"{self._slack}."
+                f"{now}."
             )
 
     def _even_exposures(self, step: int) -> None:

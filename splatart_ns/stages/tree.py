@@ -48,12 +48,13 @@ hinge whose axis its parent and the child itself turn about on the root, as door
 that the other two do not, and a drawer shows where it nears its neighbour but not where it touches the body. And that
 of a part that is nearly fixed to such a one, but not quite: both moved by about as much. And that of a slide between
 two parts that turn about parallel lines on the root: from one state to another by the same angle."""
-_NOT_QUITE, _OF_MOTION = 0.004, 0.15
+_NOT_QUITE, _OF_MOTION = 0.002, 0.15
 """Least residual of such a fixed joint, as a share of the object's radius: a handle's on its door is as small as the
-errors of poses are. Or as a share of what a fixed joint to the root leaves, if that is less: of two buttons that moved
-by 0.011 and 0.013 radii it is a fifth."""
-_PARALLEL = 0.98
-"""Least cosine of the angle between slides along one way, and hinges about one line."""
+errors of poses are; of two of a desk's seven drawers it was 0.0028. Or as a share of what a fixed joint to the root
+leaves, if that is less: of two buttons that moved by 0.011 and 0.013 radii it is a fifth."""
+_PARALLEL, _ASTRAY = 0.98, 0.004
+"""Least cosine of the angle between slides along one way, and hinges about one line. A slide that leads aside by less
+than the second, as a share of the object's radius, goes along it, too: so short a one goes where the poses err."""
 _ONE_LINE = 0.1
 """How far such hinges may lie apart, as a share of the object's radius."""
 _IN_TOUCH = 0.1
@@ -261,6 +262,8 @@ def _stacked(
     kinds = {fit.type for fit in fits}
     if kinds not in ({"prismatic"}, {"revolute"}):
         return _STACKED
+    if kinds == {"prismatic"} and _leads_aside(between, on_root[0].axis) < _ASTRAY * object_radius:
+        fits = on_root
     axes = torch.stack([fit.axis for fit in fits])
     if not bool(((axes @ axes.T).abs() > _PARALLEL).all()):
         return _STACKED
@@ -270,6 +273,11 @@ def _stacked(
         if bool((apart > _ONE_LINE * object_radius).any()):
             return _STACKED
     return _STACKED_ALIKE
+
+
+def _leads_aside(slide: JointFit, axis: Tensor) -> float:
+    """How far, at most, a slide leads from the way along `axis` [3]."""
+    return float(torch.linalg.cross(slide.axis, axis).norm() * slide.values.abs().max())
 
 
 def _closes_loop(tree: KinematicTree, joint: Joint, contact: Contact, object_radius: float) -> bool:

@@ -7,6 +7,7 @@ from splatart_ns.geometry.se3 import se3_exp
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import hull
 from splatart_ns.stages.hull import (
+    EXACT,
     MIN_POINTS_PER_PART,
     POINTS_PER_PART,
     POINTS_PER_PIXEL,
@@ -149,12 +150,24 @@ def test_no_silhouette_gives_no_hull():
 def test_silhouettes_of_wrong_cameras_have_slack():
     splat = box(1, (0.8, 0.12, 0.12), (0.0, 0.0, 0.0))
     views = photograph(splat, 12)
-    pixels, hull = slack(views)
-    assert pixels == 0
+    found, hull = slack(views)
+    assert found == EXACT
     assert torch.equal(hull[0], visual_hull(views)[0])
     g = torch.Generator().manual_seed(0)
     wrong = [replace(v, viewmat=se3_exp(0.02 * torch.randn(6, generator=g)) @ v.viewmat) for v in views]
-    pixels, _ = slack(wrong)
-    assert pixels > 0
-    few, many = visual_hull(wrong), visual_hull(wrong, slack=pixels)
+    found, _ = slack(wrong)
+    assert found.pixels > 0
+    few, many = visual_hull(wrong), visual_hull(wrong, slack=found)
     assert few is None or len(few[0]) < len(many[0])
+
+
+def test_views_that_lose_a_plate_from_its_edge_are_no_slack_of_the_cameras():
+    views = photograph(box(1, (0.8, 0.12, 0.12), (0.0, 0.0, 0.0)), 12)
+    lost = [*views[1:], replace(views[0], alpha=views[0].alpha.clone())]
+    lost[-1].alpha[:, : lost[-1].width // 2] = 0
+    found, hull = slack(lost)
+    assert (found.pixels, found.views) == (0, 1)
+    without, _ = visual_hull(lost)
+    assert float(hull[0][:, 0].min()) < -0.45 < -0.3 < float(without[:, 0].min())
+    inside = carve(lost, hull[0], dilate=1, erring=1)
+    assert inside.all() and not carve(lost, hull[0], dilate=1).all()

@@ -449,8 +449,8 @@ def test_between_nearly_equal_parents_the_root_wins(kind, apart, closer, parent)
 @pytest.mark.parametrize("kind", ["prismatic", "revolute"])
 @pytest.mark.parametrize(
     "residual, travel, parent",
-    [(0.006, 0.2, 1), (0.002, 0.2, 2), (0.002, 0.01, 1), (0.001, 0.01, 2)],
-    ids=["nearly fixed", "fixed", "two buttons", "fixed on a button"],
+    [(0.006, 0.2, 1), (0.0028, 0.2, 1), (0.0015, 0.2, 2), (0.002, 0.01, 1), (0.001, 0.01, 2)],
+    ids=["nearly fixed", "hardly not fixed", "fixed", "two buttons", "fixed on a button"],
 )
 def test_of_two_that_moved_nearly_alike_none_hangs_on_the_other_but_a_handle_does(kind, residual, travel, parent):
     def move(value):
@@ -459,6 +459,21 @@ def test_of_two_that_moved_nearly_alike_none_hangs_on_the_other_but_a_handle_doe
 
     fixed = JointFit("fixed", 0 * X, 0 * X, 0.0, torch.zeros(2).double(), residual=residual)
     joints = {(1, 2): move(travel), (1, 3): move(1.05 * travel), (2, 3): fixed}
+    joints |= {(b, a): fit for (a, b), fit in joints.items()}
+    on_axis = torch.zeros(2, 3).double()
+    gaps = {(1, 2): 0.02, (1, 3): 0.09, (2, 3): 0.03}
+    contacts = {pair: Contact(gap, on_axis, (on_axis, on_axis)) for pair, gap in gaps.items()}
+    tree = build_tree([1, 2, 3], joints, contacts, 1, 1.0)
+    assert {j.child: j.parent for j in tree.joints} == {2: 1, 3: parent}
+
+
+@pytest.mark.parametrize("aside, parent", [(0.0, 1), (0.003, 1), (0.006, 2)])
+def test_of_two_drawers_that_slid_nearly_alike_none_slides_aside_on_the_other(aside, parent):
+    def slide(x, y=0.0):
+        way = torch.tensor([x, y, 0.0]).double()
+        return JointFit("prismatic", way / way.norm(), 0 * X, 0.0, torch.stack([way[2], way.norm()]), residual=0)
+
+    joints = {(1, 2): slide(0.4), (1, 3): slide(0.41, aside), (2, 3): slide(0.01, aside)}
     joints |= {(b, a): fit for (a, b), fit in joints.items()}
     on_axis = torch.zeros(2, 3).double()
     gaps = {(1, 2): 0.02, (1, 3): 0.09, (2, 3): 0.03}
