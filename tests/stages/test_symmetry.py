@@ -103,6 +103,26 @@ def test_the_turn_of_a_round_part_that_is_hidden_in_part_is_untold(under_a_fork,
     assert (twist[:3] + torch.linalg.cross(twist[3:], TILT[:3, 3])).norm() < 0.03  # the disc's own centre stays
 
 
+def test_a_wheel_that_is_hardly_round_may_have_turned(under_a_fork, monkeypatch):
+    """More of it is hidden, or light falls on it: turned, it costs more, but little more if it is turned by little."""
+    monkeypatch.setattr(symmetry, "similar_axes", lambda splat: torch.zeros(0, 3))
+    monkeypatch.setattr(symmetry, "_axis_of_symmetry", lambda *_: None)
+    settled, untold = settle_turn(*under_a_fork, 2, EYE)
+    assert torch.equal(settled, EYE)
+    assert float(untold[3:, 3:].trace()) == pytest.approx(math.pi**2 / 3, rel=1e-6)
+    twist = torch.linalg.eigh(untold).eigenvectors[:, -1]
+    assert abs(float(twist[3:] @ TILT[:3, 2]) / float(twist[3:].norm())) > math.cos(math.radians(3))
+
+
+def test_a_bar_whose_turn_silhouettes_hardly_tell_rests(monkeypatch):
+    splats, views = scene(tilted_box, EYE, size=(0.2, 0.2, 0.8))
+    axis = TILT[:3, 2]
+    about = torch.cat([torch.linalg.cross(TILT[:3, 3], axis), axis])
+    monkeypatch.setattr(symmetry, "_unseen_turns", lambda *_: about[None])
+    settled, untold = settle_turn(splats, views, 2, EYE)
+    assert torch.equal(settled, EYE) and not untold.any()
+
+
 def test_of_a_part_that_turned_otherwise_silhouettes_are_not_asked(under_a_fork, monkeypatch):
     monkeypatch.setattr(symmetry, "similar_axes", lambda splat: torch.zeros(0, 3))
     splats, views = under_a_fork
