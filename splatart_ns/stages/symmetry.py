@@ -86,22 +86,24 @@ def settle_turn(
         if bool((axes @ guess[3:] > math.cos(math.radians(SAME_AXIS))).any()):
             continue
         twist = _axis_of_symmetry(pair, T, guess)
-        # A wheel is not round where no view shows it, and looks best as light falls on it. It may have turned, no
-        # matter by how much it seems to have.
+        # A wheel is not round where no view shows it, and looks best as light falls on it. Unless the images tell that
+        # it rests, it may have turned.
         hardly_round = twist is None and k < len(unseen)
         if hardly_round:
             twist = guess
         if twist is None:
             continue
-        axes = torch.cat([axes, twist[None, 3:], -twist[None, 3:]])
         angle, told = _told_turn(pair, T, twist)
         if not told:  # what tells it may not show in so few views
             angle, told = _told_turn(part_pair(splats, views, part, DOUBTFUL_VIEWS, COARSE_PIXELS), T, twist)
+        if hardly_round and told:
+            continue
+        axes = torch.cat([axes, twist[None, 3:], -twist[None, 3:]])
         if not told:
             untold = untold + math.pi**2 / 3 * twist.outer(twist)
             back = se3_exp(_least_turn(T, twist) * twist) @ T
             T = back if so3_log(back[:3, :3]).norm() < math.radians(UNTURNED) else T
-        elif not hardly_round and abs(math.remainder(angle, 2 * math.pi)) > math.radians(DIP + 0.5 * STEP):
+        elif abs(math.remainder(angle, 2 * math.pi)) > math.radians(DIP + 0.5 * STEP):
             T = se3_exp(angle * twist) @ T
     return T, untold
 
