@@ -103,10 +103,18 @@ def test_the_turn_of_a_round_part_that_is_hidden_in_part_is_untold(under_a_fork,
     assert (twist[:3] + torch.linalg.cross(twist[3:], TILT[:3, 3])).norm() < 0.03  # the disc's own centre stays
 
 
-def test_a_wheel_that_is_hardly_round_may_have_turned(under_a_fork, monkeypatch):
-    """More of it is hidden, or light falls on it: turned, it costs more, but little more if it is turned by little."""
+@pytest.fixture
+def hardly_round(monkeypatch):
+    """More of a part is hidden, or light falls on it, so that half a turn shows."""
     monkeypatch.setattr(symmetry, "similar_axes", lambda splat: torch.zeros(0, 3))
     monkeypatch.setattr(symmetry, "_axis_of_symmetry", lambda *_: None)
+
+
+def about(axis, centre=TILT[:3, 3]):
+    return torch.cat([torch.linalg.cross(centre, axis), axis])
+
+
+def test_a_wheel_that_is_hardly_round_may_have_turned(under_a_fork, hardly_round):
     settled, untold = settle_turn(*under_a_fork, 2, EYE)
     assert torch.equal(settled, EYE)
     assert float(untold[3:, 3:].trace()) == pytest.approx(math.pi**2 / 3, rel=1e-6)
@@ -114,12 +122,15 @@ def test_a_wheel_that_is_hardly_round_may_have_turned(under_a_fork, monkeypatch)
     assert abs(float(twist[3:] @ TILT[:3, 2]) / float(twist[3:].norm())) > math.cos(math.radians(3))
 
 
-def test_a_bar_whose_turn_silhouettes_hardly_tell_rests(monkeypatch):
-    splats, views = scene(tilted_box, EYE, size=(0.2, 0.2, 0.8))
-    axis = TILT[:3, 2]
-    about = torch.cat([torch.linalg.cross(TILT[:3, 3], axis), axis])
-    monkeypatch.setattr(symmetry, "_unseen_turns", lambda *_: about[None])
-    settled, untold = settle_turn(splats, views, 2, EYE)
+def test_of_several_axes_none_is_a_hardly_round_parts(under_a_fork, hardly_round, monkeypatch):
+    axes = [about(TILT[:3, k]) for k in (2, 1)]
+    monkeypatch.setattr(symmetry, "_unseen_turns", lambda *_: torch.stack(axes))
+    assert not settle_turn(*under_a_fork, 2, EYE)[1].any()
+
+
+def test_a_bar_whose_turn_silhouettes_hardly_tell_rests(hardly_round, monkeypatch):
+    monkeypatch.setattr(symmetry, "_unseen_turns", lambda *_: about(TILT[:3, 2])[None])
+    settled, untold = settle_turn(*scene(tilted_box, EYE, size=(0.2, 0.2, 0.8)), 2, EYE)
     assert torch.equal(settled, EYE) and not untold.any()
 
 
@@ -141,9 +152,9 @@ def test_what_hides_the_same_of_a_part_in_both_states_does_not_tell_that_it_rest
     cost = torch.where(angles.sin().abs() + (angles.cos() < 0) > math.sin(math.radians(symmetry.DIP)), 1 + rise, 1.0)
     monkeypatch.setattr(symmetry, "_swept", lambda *_: (angles, cost))
     pair = part_pair(*plain, 2, VIEWS, 400)
-    about = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]).double()
-    assert symmetry._told_turn(pair, EYE, about)[1] == rested
-    assert symmetry._told_turn(pair, motion((0, 0, 40), (0, 0, 0)), about)[1] == turned
+    upright = about(torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double())
+    assert symmetry._told_turn(pair, EYE, upright)[1] == rested
+    assert symmetry._told_turn(pair, motion((0, 0, 40), (0, 0, 0)), upright)[1] == turned
 
 
 def test_what_tells_a_turn_in_some_of_the_views_does(monkeypatch):
@@ -203,10 +214,10 @@ def test_a_marked_disc_that_seems_still_is_turned_to_where_its_mark_is():
 
 @pytest.mark.parametrize(("slip", "held"), [(8, True), (40, False)])
 def test_a_turn_that_even_light_does_not_tell_is_as_uncertain_as_it_slips(plain, monkeypatch, slip, held):
-    about = TILT @ motion((0, 0, -slip), (0, 0, 0)) @ inverse(TILT)
+    slipped = TILT @ motion((0, 0, -slip), (0, 0, 0)) @ inverse(TILT)
 
     def ends(pair, T, iterations=20, **_):
-        return Refinement(about @ T if pair.even_light and iterations else T, 0.0, True, 1, None)
+        return Refinement(slipped @ T if pair.even_light and iterations else T, 0.0, True, 1, None)
 
     def covariance(pair, T, equations=None):
         return torch.zeros(6, 6).to(T)
@@ -215,7 +226,7 @@ def test_a_turn_that_even_light_does_not_tell_is_as_uncertain_as_it_slips(plain,
     monkeypatch.setattr(pose_evidence, "refine", ends)
     monkeypatch.setattr(pose_evidence, "motion_covariance", covariance)
     monkeypatch.setattr(pose_evidence, "_slid_a_little", lambda *_: None)
-    T, uncertain = poses(*plain, about @ TURNED)
+    T, uncertain = poses(*plain, slipped @ TURNED)
     sigma = torch.linalg.eigvalsh(uncertain[1, 1, 3:, 3:])[-1].sqrt()
     if held:
         assert torch.allclose(T[1, 1], TURNED)
