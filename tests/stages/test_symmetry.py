@@ -122,14 +122,19 @@ def test_a_wheel_that_is_hardly_round_may_have_turned(under_a_fork, hardly_round
     assert abs(float(twist[3:] @ TILT[:3, 2]) / float(twist[3:].norm())) > math.cos(math.radians(3))
 
 
-def test_of_several_axes_none_is_a_hardly_round_parts(under_a_fork, hardly_round, monkeypatch):
-    axes = [about(TILT[:3, k]) for k in (2, 1)]
-    monkeypatch.setattr(symmetry, "_unseen_turns", lambda *_: torch.stack(axes))
-    assert not settle_turn(*under_a_fork, 2, EYE)[1].any()
+@pytest.mark.parametrize(
+    "axes, share, untold", [((2, 1), 0.95, False), ((2,), 0.95, True), ((2,), 0.8, False)], ids=["two", "one", "aside"]
+)
+def test_of_several_axes_or_one_that_misses_it_none_is_a_hardly_round_parts(
+    under_a_fork, hardly_round, monkeypatch, axes, share, untold
+):
+    found = torch.stack([about(TILT[:3, k]) for k in axes]), torch.full((len(axes),), share)
+    monkeypatch.setattr(symmetry, "_unseen_turns", lambda *_: found)
+    assert bool(settle_turn(*under_a_fork, 2, EYE)[1].any()) == untold
 
 
 def test_a_bar_whose_turn_silhouettes_hardly_tell_rests(hardly_round, monkeypatch):
-    monkeypatch.setattr(symmetry, "_unseen_turns", lambda *_: about(TILT[:3, 2])[None])
+    monkeypatch.setattr(symmetry, "_unseen_turns", lambda *_: (about(TILT[:3, 2])[None], torch.ones(1)))
     settled, untold = settle_turn(*scene(tilted_box, EYE, size=(0.2, 0.2, 0.8)), 2, EYE)
     assert torch.equal(settled, EYE) and not untold.any()
 
