@@ -34,14 +34,14 @@ MAYBE_ROUND = 0.03
 """Turning them about their principal axis raises the cost per pixel by less than this."""
 ROUND = 0.01
 """About their exact axis, by less than this: discs measured 0.001 to 0.003, what is not round 0.02 to 0.5."""
-BLIND = 0.25
+BLIND = 0.1
 """Silhouettes are blind to a turn that they weigh by less than this share of what they weigh the median motion by; the
-turns of a lens and of two wheels they weigh by 0.005 to 0.02, those of wire wheels by 0.1."""
+turns of a lens and of two wheels they weigh by 0.005 to 0.02."""
 MOSTLY = 0.5
 """Least share of rotation in such a motion, its translation in radii: axes of half-hidden wheels miss the centroid."""
-NEARLY_ALL = 0.9
-"""Least share of it where nothing else says that the part is round. Of wheels it was 0.95; 0.57 and 0.78 of two motions
-of a half-hidden turntable, whose axis they miss by 42 and 29 degrees."""
+HALF_BLIND, NEARLY_ALL = 0.25, 0.9
+"""And to the motion that they weigh least, if by less than this, and if it is rotation by this share: of wire wheels and
+knobs 0.09 to 0.16, and 0.95 to 1. Of a half-hidden turntable they weigh a shift least, and turns about other axes."""
 SAME_AXIS = 20
 """Degrees between axes that are one."""
 STEP = 5
@@ -140,9 +140,10 @@ def _unseen_turns(pair: PartPair, T: Tensor) -> tuple[Tensor, Tensor]:
     """
     silhouettes = replace(pair, chroma_weight=0.0, brightness_weight=0.0)
     weights, motions = torch.linalg.eigh(normal_equations(silhouettes, T, 6).H.sum(0))
-    motions = motions.mT[weights < BLIND * weights[3]]
-    shares = motions[:, 3:].norm(dim=-1)
-    motions, shares = motions[shares > MOSTLY], shares[shares > MOSTLY]
+    shares = motions.mT[:, 3:].norm(dim=-1)
+    blind = (weights < BLIND * weights[3]) & (shares > MOSTLY)
+    blind[0] |= (weights[0] < HALF_BLIND * weights[3]) & (shares[0] > NEARLY_ALL)
+    motions, shares = motions.mT[blind], shares[blind]
     shift, axes = pair.radius * motions[:, :3] / shares[:, None], motions[:, 3:] / shares[:, None]
     shift = shift - (shift * axes).sum(-1, keepdim=True) * axes
     pivot = transform_points(T, pair.centroid[None])
