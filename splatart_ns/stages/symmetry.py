@@ -41,7 +41,7 @@ MOSTLY = 0.5
 """Least share of rotation in such a motion, its translation in radii: axes of half-hidden wheels miss the centroid."""
 HALF_BLIND, NEARLY_ALL = 0.25, 0.9
 """And to the motion that they weigh least, if by less than this, and if it is rotation by this share: of wire wheels
-and knobs 0.09 to 0.16, and 0.95 to 1. Of a half-hidden turntable they weigh a shift least, and turns about other axes."""
+and knobs 0.09 to 0.16, and 0.95 to 1. Of a half-hidden turntable they weigh a shift least."""
 SAME_AXIS = 20
 """Degrees between axes that are one."""
 STEP = 5
