@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -39,7 +38,7 @@ UNCOVERED = 0.005
 """A hull fills silhouettes if it misses no more than this share of them. Of exact cameras it missed none; of cameras
 that were half a degree and half a percent off, with thin parts, half."""
 EDGE_ON, FAINT, EDGE_ON_UNCOVERED = 0.02, 60, 1e-4
-"""Silhouettes lose what is thinner than a pixel, as a flap seen from its edge. Where this share of the views may err,
+"""Silhouettes lose what is thinner than a pixel, as a flap seen from its edge. Where this share of many views may err,
 and pixels (0..255) count that are covered by a quarter, exact cameras of flaps and wires missed nothing, cameras a
 tenth of a degree off 0.0003 of the silhouettes at least."""
 
@@ -109,8 +108,8 @@ def slack(views: Sequence[View]) -> tuple[Slack, Hull | None]:
 
     No pixels where the cameras are exact, or some, or the most of `SLACKS` where even that does not do.
     """
-    few = math.ceil(EDGE_ON * len(views))
-    for allowed in (EXACT, Slack(views=few), *map(Slack, SLACKS)):
+    few = round(EDGE_ON * len(views))
+    for allowed in (EXACT, *([Slack(views=few)] if few > 0 else []), *map(Slack, SLACKS)):
         hull = visual_hull(views, slack=allowed)
         if hull is not None and _uncovered(views, *hull) < (EDGE_ON_UNCOVERED if allowed.views else UNCOVERED):
             break
