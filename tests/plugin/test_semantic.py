@@ -1,6 +1,7 @@
 import copy
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 
 from splatart_ns.plugin.semantic_run import learned_views
 from splatart_ns.stages.camera_refinement import PASSES
+from splatart_ns.stages.hull import Slack
 
 
 def test_growth_stops_at_the_limit(capture_dir, semantic_trainer):
@@ -34,6 +36,16 @@ def test_gaussians_outside_the_silhouettes_fade(capture_dir, semantic_trainer):
     assert before[:10].sigmoid().min() > 0.05 > model.opacities[:10].sigmoid().max()
     kept = model.opacities[10:] == before[10:]
     assert kept.float().mean() > 0.9
+
+
+@pytest.mark.parametrize("slack, stay", [(Slack(), False), (Slack(views=1), True)])
+def test_gaussians_that_a_view_loses_which_may_err_do_not_fade(capture_dir, semantic_trainer, slack, stay):
+    pipeline = semantic_trainer(capture_dir).pipeline
+    before = pipeline.model.opacities.detach().clone()
+    pipeline._views[0] = replace(pipeline._views[0], alpha=torch.zeros_like(pipeline._views[0].alpha))
+    pipeline._slack, pipeline.model.config.refine_every = slack, 4
+    pipeline._keep_inside(4)
+    assert ((pipeline.model.opacities == before).float().mean() > 0.9) == stay
 
 
 def test_only_part_logits_learn_in_the_second_phase(capture_dir, semantic_trainer):
