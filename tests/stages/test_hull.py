@@ -172,3 +172,9 @@ def test_of_many_views_one_that_loses_a_plate_from_its_edge_is_no_slack_of_the_c
     inside = carve(lost, hull[0], dilate=1, erring=1)
     assert inside.all() and not carve(lost, hull[0], dilate=1).all()
     assert slack(lost[-12:])[0].pixels > 0
+
+
+def test_where_a_view_may_err_what_is_a_quarter_covered_counts():
+    faint = [replace(view, alpha=view.alpha // 4) for view in VIEWS]
+    centre = torch.tensor([[0.0, 0.0, -0.1]])
+    assert carve(faint, centre, 0, erring=1).all() and not carve(faint, centre, 0).any()

@@ -11,7 +11,7 @@ from splatart_ns.stages import pose_evidence, symmetry
 from splatart_ns.stages.joint import fit_joint
 from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.pose_evidence import refine_poses
-from splatart_ns.stages.refinement import Refinement
+from splatart_ns.stages.refinement import NormalEquations, Refinement
 from splatart_ns.stages.render_choice import DOUBTFUL_VIEWS, VIEWS
 from splatart_ns.stages.symmetry import settle_turn
 from splatart_ns.stages.unseen import may_have_turned
@@ -101,6 +101,36 @@ def test_the_turn_of_a_round_part_that_is_hidden_in_part_is_untold(under_a_fork,
     twist = twist / twist[3:].norm()
     assert abs(float(twist[3:] @ TILT[:3, 2])) > math.cos(math.radians(3))
     assert (twist[:3] + torch.linalg.cross(twist[3:], TILT[:3, 3])).norm() < 0.03  # the disc's own centre stays
+
+
+@pytest.mark.parametrize(
+    "weights, told",
+    [
+        ([1, 1, 1, 1.2, 0.05, 1.3], 1),
+        ([1, 1, 1, 1.2, 0.2, 1.3], 1),
+        ([1, 1, 1, 1.2, 0.3, 1.3], 0),
+        ([0.1, 1, 1, 1.2, 0.2, 1.3], 0),
+        ([1, 1, 1, 1.2, 0.05, 0.06], 2),
+    ],
+    ids=["blind", "half blind", "not blind", "more so to a shift", "to two"],
+)
+def test_silhouettes_are_blind_to_turns_that_they_hardly_weigh(plain, monkeypatch, weights, told):
+    H = torch.tensor(weights).double().diag()
+    monkeypatch.setattr(symmetry, "normal_equations", lambda *_: NormalEquations(H[None], torch.zeros(1, 6), 0.0))
+    twists, shares = symmetry._unseen_turns(part_pair(*plain, 2, VIEWS, 400), EYE)
+    assert len(twists) == told and torch.allclose(shares, torch.ones(told).double())
+    if told:
+        assert torch.allclose(twists[0, 3:].abs(), torch.tensor([0.0, 1.0, 0.0]).double())
+
+
+def test_silhouettes_are_blind_to_a_turn_that_also_shifts_only_if_they_hardly_weigh_it(plain, monkeypatch):
+    """Rotation is 0.8 of it."""
+    mixed = torch.eye(6).double()
+    mixed[:, 0], mixed[:, 4] = 0.8 * mixed[:, 4] + 0.6 * mixed[:, 0], 0.6 * mixed[:, 4] - 0.8 * mixed[:, 0]
+    for weight, told in ((0.05, 1), (0.2, 0)):
+        H = mixed @ torch.tensor([weight, 1, 1, 1.2, 1.1, 1.3]).double().diag() @ mixed.mT
+        monkeypatch.setattr(symmetry, "normal_equations", lambda *_, H=H: NormalEquations(H[None], None, 0.0))
+        assert len(symmetry._unseen_turns(part_pair(*plain, 2, VIEWS, 400), EYE)[0]) == told
 
 
 @pytest.fixture
