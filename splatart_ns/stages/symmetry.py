@@ -96,11 +96,13 @@ def settle_turn(
     for k, guess in enumerate(torch.cat([unseen, _similar_turns(pair, T)])):
         if bool((axes @ guess[3:] > math.cos(math.radians(SAME_AXIS))).any()):
             continue
+        # Of several turns to which silhouettes are blind none need be that about the part's own axis.
+        own = k == 0 and len(unseen) == 1 and shares[0] > NEARLY_ALL
+        if own and any(_rests(look(n), T, guess) for n in (VIEWS, DOUBTFUL_VIEWS)):
+            continue
         twist = _axis_of_symmetry(pair, T, guess)
         if twist is None:
-            # Of several turns to which silhouettes are blind none need be that about the part's own axis.
-            own = k == 0 and len(unseen) == 1 and shares[0] > NEARLY_ALL
-            if own and not any(_rests(look(n), T, guess) for n in (VIEWS, DOUBTFUL_VIEWS)):
+            if own:
                 axes = torch.cat([axes, guess[None, 3:], -guess[None, 3:]])
                 untold = untold + math.pi**2 / 3 * guess.outer(guess)
             continue

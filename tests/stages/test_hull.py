@@ -178,3 +178,10 @@ def test_where_a_view_may_err_what_is_a_quarter_covered_counts():
     faint = [replace(view, alpha=view.alpha // 4) for view in VIEWS]
     centre = torch.tensor([[0.0, 0.0, -0.1]])
     assert carve(faint, centre, 0, erring=1).all() and not carve(faint, centre, 0).any()
+
+
+def test_views_that_may_err_do_not_hide_that_cameras_are_a_little_off():
+    g = torch.Generator().manual_seed(0)
+    views = photograph(box(1, (0.8, 0.12, 0.12), (0.0, 0.0, 0.0)), 30)
+    wrong = [replace(v, viewmat=se3_exp(0.006 * torch.randn(6, generator=g)) @ v.viewmat) for v in views]
+    assert slack(wrong)[0].pixels > 0

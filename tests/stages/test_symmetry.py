@@ -169,6 +169,16 @@ def test_a_bar_whose_turn_silhouettes_hardly_tell_rests(hardly_round, monkeypatc
     assert torch.equal(settled, EYE) and not untold.any()
 
 
+def test_what_tells_that_a_hardly_round_part_rests_may_show_in_some_of_the_views(
+    under_a_fork, hardly_round, monkeypatch
+):
+    asked = []
+    monkeypatch.setattr(symmetry, "_unseen_turns", lambda *_: (about(TILT[:3, 2])[None], torch.ones(1)))
+    monkeypatch.setattr(symmetry, "_rests", lambda pair, *_: asked.append(pair) or len(asked) == 2)
+    assert not settle_turn(*under_a_fork, 2, EYE)[1].any()
+    assert len(asked[0].views[0]) == VIEWS < len(asked[1].views[0])
+
+
 def test_of_a_part_that_turned_otherwise_silhouettes_are_not_asked(under_a_fork, monkeypatch):
     monkeypatch.setattr(symmetry, "similar_axes", lambda splat: torch.zeros(0, 3))
     splats, views = under_a_fork
