@@ -56,7 +56,7 @@ tells that as well. Plain wheels of which much is hidden measured 1.08 to 1.15, 
 HARDLY_ROUND = 2.0
 """And this many times, by turns of `DIP` and a step, where half a turn shows that a part is not round, but silhouettes
 are blind to its turn. Wheels that are half hidden or lit from one side, knobs and a turntable that turned measured 1.0
-to 1.6, 18 parts that rest 3.3 to 29."""
+to 1.6, 20 parts that rest 3.3 to 29."""
 TOLD_SHARE = 0.05
 """And by this share of what the worst costs more: else it may be light, whose wide dips measured 0.02 at most."""
 UNTURNED = 5
