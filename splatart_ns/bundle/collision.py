@@ -16,35 +16,36 @@ _LOST_VOLUME = 0.1
 """Share of the volume that this may change."""
 _CONCAVITY = 0.08
 """Tolerated difference between a piece and its hull, in CoACD's measure, of the mesh scaled to sides of 2."""
+_PIECES = 12
+"""At most."""
+_VERTICES = 32
+"""Of a piece, at most."""
 
 
-def convex_pieces(mesh: trimesh.Trimesh, *, pieces: int = 12, vertices: int = 32) -> list[trimesh.Trimesh]:
-    """Watertight convex meshes that together are close to `mesh`, in its frame; its one convex hull without `coacd`.
+def convex_pieces(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """Watertight convex meshes that together are close to the watertight `mesh`, in its frame.
+
+    Its one convex hull without `coacd`.
 
     By collision-aware concavity and tree search (Wei et al. 2022, "Approximate Convex Decomposition for 3D Meshes with
     Collision-Aware Concavity and Tree Search"). Deterministic.
-
-    Args:
-        mesh: Watertight.
-        pieces: Most pieces.
-        vertices: Most vertices of a piece.
     """
     hull = mesh.convex_hull
     if hull.volume < 1.05 * mesh.volume:
-        return [_with_few_vertices(hull, vertices)]
+        return [_with_few_vertices(hull)]
     try:
         import coacd
     except ImportError:
         _log.warning(
             "collision shapes are whole convex hulls; `pip install 'splatart-ns[sim]'` brings coacd to take them apart"
         )
-        return [_with_few_vertices(hull, vertices)]
+        return [_with_few_vertices(hull)]
     coacd.set_log_level("error")
     simple = _with_few_triangles(mesh)
     found = coacd.run_coacd(
         coacd.Mesh(simple.vertices, simple.faces),
         threshold=_CONCAVITY,
-        max_convex_hull=pieces,
+        max_convex_hull=_PIECES,
         # Solid and without holes already, the mesh needs none of the voxels that it would be rebuilt from.
         preprocess_mode="off" if simple.is_volume else "on",
         # A shallow search takes a small part of the default's time and finds pieces nearly as tight.
@@ -53,11 +54,11 @@ def convex_pieces(mesh: trimesh.Trimesh, *, pieces: int = 12, vertices: int = 32
         mcts_nodes=6,
         mcts_max_depth=1,
         decimate=True,
-        max_ch_vertex=vertices,
+        max_ch_vertex=_VERTICES,
         seed=0,
     )
     hulls = [_hull_of(points) for points, _ in found]
-    return [piece for piece in hulls if piece is not None] or [_with_few_vertices(hull, vertices)]
+    return [piece for piece in hulls if piece is not None] or [_with_few_vertices(hull)]
 
 
 def _hull_of(points: np.ndarray) -> trimesh.Trimesh | None:
@@ -84,16 +85,16 @@ def _with_few_triangles(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(data.vert_properties[:, :3].astype(np.float64), data.tri_verts, process=False)
 
 
-def _with_few_vertices(hull: trimesh.Trimesh, vertices: int) -> trimesh.Trimesh:
-    """The hull of vertices of a convex mesh far apart from each other, so many at most."""
+def _with_few_vertices(hull: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The hull of vertices of a convex mesh far apart from each other, `_VERTICES` at most."""
     points = np.asarray(hull.vertices)
-    if len(points) <= vertices:
+    if len(points) <= _VERTICES:
         return hull
     # Farthest point sampling, from the outermost vertex.
     distance = np.linalg.norm(points - points.mean(0), axis=1)
     chosen = [int(distance.argmax())]
     distance = np.linalg.norm(points - points[chosen[0]], axis=1)
-    while len(chosen) < vertices:
+    while len(chosen) < _VERTICES:
         chosen.append(int(distance.argmax()))
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return trimesh.convex.convex_hull(points[chosen])

@@ -9,6 +9,8 @@ import numpy as np
 
 WHITE = np.full((1, 1, 3), 255, dtype=np.uint8)
 """The texture of a face that has none."""
+CREASE = 35.0
+"""Degrees between faces from which on they meet in an edge instead of being one smooth surface."""
 
 
 @dataclass(frozen=True)
@@ -138,8 +140,8 @@ def merge_coincident(surface: Surface) -> Surface:
     return replace(surface, sides=shown)
 
 
-def smooth_normals(corners: np.ndarray, crease_degrees: float = 35.0) -> np.ndarray:
-    """Corner normals [F, 3, 3]: the mean, by area, over the faces at that point that bend less than a crease."""
+def smooth_normals(corners: np.ndarray) -> np.ndarray:
+    """Corner normals [F, 3, 3]: the mean, by area, over the faces at that point that bend less than `CREASE`."""
     if len(corners) == 0:
         return corners
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -155,7 +157,7 @@ def smooth_normals(corners: np.ndarray, crease_degrees: float = 35.0) -> np.ndar
     within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     b = by_point[np.repeat(start, count) + within]
 
-    near = np.einsum("pk,pk->p", unit[face[a]], unit[face[b]]) > np.cos(np.radians(crease_degrees))
+    near = np.einsum("pk,pk->p", unit[face[a]], unit[face[b]]) > np.cos(np.radians(CREASE))
     a, b = a[near], b[near]
     total = np.stack([np.bincount(a, doubled[face[b], k], minlength=len(point)) for k in range(3)], axis=-1)
     total /= np.linalg.norm(total, axis=-1, keepdims=True)

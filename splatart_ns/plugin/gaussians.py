@@ -30,8 +30,10 @@ def gauss_params_from_splat(splat: Splat) -> dict[str, nn.Parameter]:
     return {name: nn.Parameter(tensor.detach().clone().contiguous()) for name, tensor in tensors.items()}
 
 
+_PREFIX = "_model.gauss_params."
+
 SPLAT_SHAPES: dict[str, tuple[int | str, ...]] = {
-    f"_model.gauss_params.{name}": ("Gaussians", *shape)
+    _PREFIX + name: ("Gaussians", *shape)
     for name, shape in {
         **{"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,), "semantics": ("parts",)},
         **{"features_dc": (3,), "features_rest": ("coefficients", 3)},
@@ -40,15 +42,15 @@ SPLAT_SHAPES: dict[str, tuple[int | str, ...]] = {
 """Of what a checkpoint's pipeline state has of a splat."""
 
 
-def splat_from_state(state: dict[str, Tensor], prefix: str = "_model.gauss_params.") -> Splat:
+def splat_from_state(state: dict[str, Tensor]) -> Splat:
     """The Gaussians in a checkpoint's pipeline state, which has tensors of `SPLAT_SHAPES`."""
-    p = {name: state[prefix + name] for name in ("means", "scales", "quats", "opacities", "semantics")}
+    p = {name: state[_PREFIX + name] for name in ("means", "scales", "quats", "opacities", "semantics")}
     return Splat(
         means=p["means"],
         quats=p["quats"],
         log_scales=p["scales"],
         opacity_logits=p["opacities"][:, 0],
-        sh=torch.cat([state[prefix + "features_dc"][:, None], state[prefix + "features_rest"]], dim=1),
+        sh=torch.cat([state[_PREFIX + "features_dc"][:, None], state[_PREFIX + "features_rest"]], dim=1),
         part_logits=p["semantics"],
     )
 

@@ -16,6 +16,11 @@ from splatart_ns.rasterize.ssim import ssim
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.semantic import depth_loss
 
+PURE = 0.9
+"""A Gaussian more likely than this of one part is not mixed."""
+KEPT = 0.9
+"""At least this share of a part's Gaussians is kept, however mixed."""
+
 
 class PartPoses(nn.Module):
     """T[state][part] as increments on the manifold about fixed base poses.
@@ -86,17 +91,17 @@ def part_extents(splat: Splat, num_parts: int) -> tuple[Tensor, Tensor]:
     return centroids, (weights * squared).sum(0).sqrt()
 
 
-def unmixed(splat: Splat, purity: float = 0.9, keep: float = 0.9) -> Tensor:
+def unmixed(splat: Splat) -> Tensor:
     """Which Gaussians belong to one part clearly enough to move with it [N] bool.
 
     A Gaussian across the seam of two parts that moves with one of them biases its pose. Left out are those whose
-    largest part probability is `purity` or less, but never more than 1 - `keep` of a part.
+    largest part probability is `PURE` or less, but never more than 1 - `KEPT` of a part.
     """
     largest, part = splat.part_probabilities.detach().max(-1)
-    chosen = largest > purity
+    chosen = largest > PURE
     for p in part.unique():
         mine = part == p
-        threshold = largest[mine].quantile(1 - keep)
+        threshold = largest[mine].quantile(1 - KEPT)
         chosen |= mine & (largest >= threshold)
     return chosen
 

@@ -24,6 +24,8 @@ RANDOM_STARTS = 40
 ITERATIONS = 25
 FOLLOWED = 16
 """Starts that are followed to the end, the best distinct ones after a third of the iterations."""
+KEPT = 10
+"""Candidates of one of `TRIMS`, at most."""
 TRIMS = (0.15, 0.5)
 """Shares of the worst correspondences that the steps leave out, for what only one of the states shows: a little, or,
 of a drawer that was shut, a lot."""
@@ -78,12 +80,12 @@ def part_points(splat: Splat, seen: Tensor, part: int) -> PartPoints:
     return PartPoints(part_splat.means.double().numpy(), rgb, weight.double().numpy())
 
 
-def register(source: PartPoints, target: PartPoints, seed: int = 0, keep: int = 10) -> Registration:
+def register(source: PartPoints, target: PartPoints, seed: int = 0) -> Registration:
     """Candidates for the motion of a part, which differ by 6 degrees or 6 % of the radius or more.
 
     Starts: no motion, centroid on centroid with no turn, with the four proper alignments of the principal axes, and
     with random turns. All starts are followed together, once for each of `TRIMS`, and the `FOLLOWED` best to the end;
-    of each, at most `keep` are kept. The two starts without a turn, and the best of a grid of slides, are also followed
+    of each, at most `KEPT` are kept. The two starts without a turn, and the best of a grid of slides, are also followed
     by sliding alone: sliding is so common that it is not to be crowded out. Needs `MIN_POINTS` points on both sides.
     """
     rng = np.random.default_rng(seed)
@@ -107,7 +109,7 @@ def register(source: PartPoints, target: PartPoints, seed: int = 0, keep: int = 
         forth = _trimmed_distance(T, sample, colour, target_tree, trim)
         back = _trimmed_distance(np.linalg.inv(T), back_sample, colour, source_tree, trim)
         fit = (forth + back) / 2
-        chosen = distinct(T, fit, source.centroid, source.radius)[:keep]
+        chosen = distinct(T, fit, source.centroid, source.radius)[:KEPT]
         chosen += [i for i in range(len(T) - len(slides), len(T)) if i not in chosen]
         motions.append(T[chosen])
         fits.append(fit[chosen])

@@ -108,9 +108,9 @@ def _warnings() -> Iterator[list[str]]:
     heard += [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
 
 
-def random_values(robot: Robot, count: int, seed: int = 0) -> list[dict[str, float]]:
-    """Values of all freedoms, evenly distributed between the limits."""
-    rng = np.random.default_rng(seed)
+def random_values(robot: Robot, count: int) -> list[dict[str, float]]:
+    """Values of all freedoms, evenly distributed between the limits; the same every time."""
+    rng = np.random.default_rng(0)
     return [robot.complete({f.name: rng.uniform(*f.limits) for f in robot.freedoms}) for _ in range(count)]
 
 
