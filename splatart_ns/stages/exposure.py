@@ -15,6 +15,9 @@ CLIPPED = 250
 """Pixels this bright may have been cut off and tell no gain."""
 DARK = 10 / 255
 """Nor do channels darker than this, of which rounding and reflections are much: their gains are drawn to 1."""
+FAINT = 0.1
+"""And a channel's gain is drawn to that of all three by this share of the light: of what is red hardly any is blue, and the
+splat's may be as wrong as it is dark."""
 
 
 @torch.no_grad()
@@ -33,8 +36,10 @@ def frame_gains(splat: Splat, views: Sequence[View], sh_degree: int | None = Non
             counts &= (view.alpha > 250)[..., None].to(counts.device)
         shown = rendering.rgb[0] * counts
         image = view.rgb.to(shown) / 255 * counts
-        dark = DARK**2 * counts.sum()
-        gains.append(((shown * image).sum((0, 1)) + dark) / (shown.square().sum((0, 1)) + dark).clamp_min(1e-12))
+        both, own = (shown * image).sum((0, 1)), shown.square().sum((0, 1))
+        dark, faint = DARK**2 * counts.sum(), FAINT * own.mean()
+        overall = both.sum() / own.sum().clamp_min(1e-12)
+        gains.append((both + dark + faint * overall) / (own + dark + faint).clamp_min(1e-12))
         tell.append(counts.any())
     gains, tell = torch.stack(gains), torch.stack(tell)
     if tell.any():

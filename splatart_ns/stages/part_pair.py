@@ -195,6 +195,10 @@ class PartPair:
         """The part's own pixels in all views, at the size at which they are compared."""
         return sum(v.area / v.factor**2 for views in self.views for v in views)
 
+    def shown_by(self, state: int) -> PartPair:
+        """The pair with the views of one state alone, source (0) or target (1), and the other's Gaussians in them."""
+        return replace(self, views=(self.views[0], ()) if state == 0 else ((), self.views[1]))
+
     def of_views(
         self, T: Tensor, measure: Callable[[Tensor, Tensor], Measure], first_order: bool = False
     ) -> list[Measure]:

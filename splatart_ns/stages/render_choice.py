@@ -43,6 +43,12 @@ OTHERS = 2
 SUSPECT = 4.0
 """A motion that fits this many times worse than each state's own Gaussians is searched for once more, more widely.
 Right ones measured 1.0 to 2.5, but for parts of which one state hides most."""
+EXPLAINED = 2.0
+"""Of such a part a motion that fits the images of one state at most this many times worse than that state's own
+Gaussians is preferred to what fits them as many times worse than it. Right ones measured 0.4 to 1.6 in one of the states, wrong ones
+4 and more."""
+ENOUGH = 0.2
+"""If that state shows at least this share of the part's pixels."""
 SEARCH_STEPS = (0.6, 0.3, 0.15, 0.08)
 """Steps of that search: part radii, and radians."""
 SLIDE_TURN = 6.0
@@ -135,6 +141,13 @@ def initial_motion(
         wide = torch.stack([search(small, T) for T in choose(coarse, everything, float("inf"), keep=5)])
         ends += [refine(fine, T, 10) for T in choose(coarse, wide, 1.5)]
     T, cost, order = ranked(fine, ends)
+    state = None
+    if ends[order[0]].cost > SUSPECT * own_cost:
+        state, ends = explained_by_one_state(coarse, fine, everything, ends, order[0])
+    if state is not None:
+        coarse, fine = coarse.shown_by(state), fine.shown_by(state)
+        identity_cost = float(fine.cost(identity[None])[0])
+        T, cost, order = ranked(fine, ends)
     known = torch.from_numpy(T[order]).to(identity)
     moved = identity_cost >= STILL_RATIO * ends[order[0]].cost
     turned = turned_alike(tiny, coarse, known[0]) if moved else known[:0]
@@ -142,6 +155,8 @@ def initial_motion(
     own = own_appearance(fine)
     if len(turned) or moved and any(looks_alike(T, cost, order[0], i, own, times) for i in order):
         coarse, fine = (part_pair(splats, views, part, DOUBTFUL_VIEWS, n) for n in (COARSE_PIXELS, FINE_PIXELS))
+        if state is not None:
+            coarse, fine = coarse.shown_by(state), fine.shown_by(state)
         identity_cost = float(fine.cost(identity[None])[0])
         ends = refined(coarse, fine, choose(coarse, torch.cat([known, turned, candidates]), SIMILAR))
         T, cost, order = ranked(fine, ends)
@@ -164,6 +179,26 @@ def initial_motion(
         alike=alike,
         maybe_moved=maybe_moved,
     )
+
+
+def explained_by_one_state(
+    coarse: PartPair, fine: PartPair, candidates: Tensor, ends: Sequence[Refinement], best: int
+) -> tuple[int | None, Sequence[Refinement]]:
+    """The state whose images a motion explains that the best of `ends` does not, and that motion with its rivals.
+
+    A drawer that is shut in one state shows nothing but its front there: moved to where the other state shows all of
+    it, it misses most of that, and may miss less if it is turned so as to cover it. Moved the other way, all that is
+    seen is there. None, and `ends`, where no motion explains the images of a state.
+    """
+    for state in (0, 1):
+        few, many = coarse.shown_by(state), fine.shown_by(state)
+        if many.area < ENOUGH * fine.area:
+            continue
+        rivals = refined(few, many, choose(few, candidates, SIMILAR))
+        least = min(end.cost for end in rivals)
+        if least < EXPLAINED * many.own_cost() and float(many.cost(ends[best].T[None])[0]) > EXPLAINED * least:
+            return state, rivals
+    return None, ends
 
 
 def turned_alike(tiny: PartPair, coarse: PartPair, T: Tensor) -> Tensor:

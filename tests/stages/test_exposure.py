@@ -56,6 +56,16 @@ def test_a_dark_channel_tells_no_gain(scene):
     assert float(frame_gains(red, faint)[:, 1:].log().std()) < 0.02
 
 
+def test_a_channel_with_little_of_the_light_tells_less_than_the_others(scene):
+    """Of a red knife with a grey blade one frame showed a quarter of the splat's blue: its colours, not its exposure."""
+    splat, _ = scene
+    red = replace(splat, sh=0.3 * splat.sh + torch.tensor([0.8, -1.2, -1.2]))
+    views = photograph(red)
+    bluer = [torch.tensor([1.0, 1.0, 0.25 if k == 3 else 1.0]) for k in range(len(views))]
+    found = frame_gains(red, exposed(views, bluer))
+    assert 0.5 < float(found[3, 2]) and float((found - 1).abs()[:, :2].max()) < 0.1
+
+
 def test_an_image_keeps_its_type():
     image = torch.tensor([[[100, 200, 50]]], dtype=torch.uint8)
     gain = torch.tensor([0.5, 0.5, 2.0])
