@@ -16,8 +16,8 @@ CLIPPED = 250
 DARK = 10 / 255
 """Nor do channels darker than this, of which rounding and reflections are much: their gains are drawn to 1."""
 FAINT = 0.1
-"""And a channel's gain is drawn to that of all three by this share of the light: of what is red hardly any is blue, and the
-splat's may be as wrong as it is dark."""
+"""And a channel's gain is drawn to that of all three by this share of the light: of what is red hardly any is blue, and
+the splat's may be as wrong as it is dark."""
 
 
 @torch.no_grad()

@@ -41,10 +41,11 @@ MOSTLY = 0.5
 """Least share of rotation in such a motion, its translation in radii: axes of half-hidden wheels miss the centroid."""
 HALF_BLIND, NEARLY_ALL = 0.25, 0.9
 """Where a part seems to rest, also to the motion that they weigh least, if by less than this, and if it is rotation by
-this share: of wire wheels and knobs 0.09 to 0.16, and 0.95 to 1. Of a half-hidden turntable they weigh a shift least."""
+this share: of wire wheels and knobs 0.09 to 0.16, and 0.95 to 1. Of a half-hidden turntable they weigh a shift
+least."""
 UNMOVED = 0.1
-"""Radii by which the centroid of a part that seems to rest may have moved. Of a drawer that slid out one state may hide so
-much that nothing fits well, and turned by 15 degrees it costs a mere 3 to 50 % more (18 drawers of five objects)."""
+"""Radii by which the centroid of a part that seems to rest may have moved. Of a drawer that slid out one state may hide
+so much that nothing fits well, and turned by 15 degrees it costs a mere 1 to 50 % more (19 drawers of five objects)."""
 SAME_AXIS = 20
 """Degrees between axes that are one."""
 STEP = 5

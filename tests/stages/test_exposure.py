@@ -57,7 +57,7 @@ def test_a_dark_channel_tells_no_gain(scene):
 
 
 def test_a_channel_with_little_of_the_light_tells_less_than_the_others(scene):
-    """Of a red knife with a grey blade one frame showed a quarter of the splat's blue: its colours, not its exposure."""
+    """Of a red knife with a grey blade one frame showed a quarter of the splat's blue: no word on its exposure."""
     splat, _ = scene
     red = replace(splat, sh=0.3 * splat.sh + torch.tensor([0.8, -1.2, -1.2]))
     views = photograph(red)
