@@ -15,9 +15,8 @@ CLIPPED = 250
 """Pixels this bright may have been cut off and tell no gain."""
 DARK = 10 / 255
 """Nor do channels darker than this, of which rounding and reflections are much: their gains are drawn to 1."""
-FAINT = 0.1
-"""And a channel's gain is drawn to that of all three by this share of the light: of what is red hardly any is blue, and
-the splat's may be as wrong as it is dark."""
+FRAMES = 16
+"""From so many frames on, gains are taken apart into what goes with the direction of view and the rest."""
 
 
 @torch.no_grad()
@@ -36,15 +35,31 @@ def frame_gains(splat: Splat, views: Sequence[View], sh_degree: int | None = Non
             counts &= (view.alpha > 250)[..., None].to(counts.device)
         shown = rendering.rgb[0] * counts
         image = view.rgb.to(shown) / 255 * counts
-        both, own = (shown * image).sum((0, 1)), shown.square().sum((0, 1))
-        dark, faint = DARK**2 * counts.sum(), FAINT * own.mean()
-        overall = both.sum() / own.sum().clamp_min(1e-12)
-        gains.append((both + dark + faint * overall) / (own + dark + faint).clamp_min(1e-12))
+        dark = DARK**2 * counts.sum()
+        gains.append(((shown * image).sum((0, 1)) + dark) / (shown.square().sum((0, 1)) + dark).clamp_min(1e-12))
         tell.append(counts.any())
     gains, tell = torch.stack(gains), torch.stack(tell)
     if tell.any():
         gains = gains / gains[tell].log().mean(0).exp()
     return torch.where(tell[:, None], gains, 1.0)
+
+
+def unevenness(gains: Tensor, views: Sequence[View]) -> float:
+    """Standard deviation of the logarithms of the views' gains [N, 3], as far as it is their exposures'.
+
+    What goes linearly with the direction of view is light: an object is brighter from where the sun is. And a view or
+    two may show what the splat has not learned yet, as a blade from its edge. So it is that of what is left, told by
+    the median of its absolute values (Hampel 1974, "The influence curve and its role in robust estimation").
+    """
+    logs = gains.log()
+    viewmats = torch.stack([view.viewmat for view in views]).to(logs)
+    terms = torch.ones_like(logs[:, :1])
+    if len(views) >= FRAMES:
+        # The camera looks along its z axis, the third row of the rotation.
+        terms = torch.cat([terms, viewmats[:, 2, :3]], -1)
+    rest = logs - terms @ torch.linalg.lstsq(terms, logs).solution
+    fewer = len(views) / max(1, len(views) - terms.shape[1])
+    return 1.4826 * fewer**0.5 * float((rest - rest.median(0).values).abs().median())
 
 
 def at_gain(rgb: Tensor, gain: Tensor) -> Tensor:
