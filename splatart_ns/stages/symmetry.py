@@ -43,6 +43,10 @@ HALF_BLIND, NEARLY_ALL = 0.25, 0.9
 """Where a part seems to rest, also to the motion that they weigh least, if by less than this, and if it is rotation by
 this share: of wire wheels and knobs 0.09 to 0.16, and 0.95 to 1. Of a half-hidden turntable they weigh a shift
 least."""
+ASTRAY = 3.0
+"""About an axis off a round part's own by an angle or, in radii, a shift e, silhouettes weigh a turn by about e^2 of
+what they weigh the median motion by. So e is at most the root of that share, which is taken for so many standard
+deviations: 25 such axes were off by 0.1 to 2.4 of these, one by 4."""
 UNMOVED = 0.1
 """Radii by which the centroid of a part that seems to rest may have moved. Of a drawer that slid out one state may hide
 so much that nothing fits well, and turned by 15 degrees it costs a mere 1 to 55 % more (20 drawers of five objects)."""
@@ -98,7 +102,7 @@ def settle_turn(
     rests = so3_log(T[:3, :3]).norm() < math.radians(UNTURNED)
     moved = transform_points(T, pair.centroid[None])[0] - pair.centroid
     stays = bool(rests and moved.norm() < UNMOVED * pair.radius)
-    unseen, shares = _unseen_turns(pair, T, stays) if rests else (T.new_zeros(0, 6), T.new_zeros(0))
+    unseen, shares, weights = _unseen_turns(pair, T, stays) if rests else (T.new_zeros(0, 6), *T.new_zeros(2, 0))
     for k, guess in enumerate(torch.cat([unseen, _similar_turns(pair, T)])):
         if bool((axes @ guess[3:] > math.cos(math.radians(SAME_AXIS))).any()):
             continue
@@ -110,7 +114,7 @@ def settle_turn(
         if twist is None:
             if own:
                 axes = torch.cat([axes, guess[None, 3:], -guess[None, 3:]])
-                untold = untold + math.pi**2 / 3 * guess.outer(guess)
+                untold = untold + math.pi**2 / 3 * guess.outer(guess) + _astray(pair, T, guess, weights[0])
             continue
         angle, told = _told_turn(pair, T, twist)
         if not told:  # what tells it may not show in so few views
@@ -141,10 +145,23 @@ def _similar_turns(pair: PartPair, T: Tensor) -> Tensor:
     return torch.cat([torch.linalg.cross(pivot.expand_as(axes), axes), axes], -1)
 
 
-def _unseen_turns(pair: PartPair, T: Tensor, half_blind: bool) -> tuple[Tensor, Tensor]:
+def _astray(pair: PartPair, T: Tensor, twist: Tensor, weight: Tensor) -> Tensor:
+    """Covariance [6, 6] of the axis of a `twist` [6], of its direction and of where it is.
+
+    Silhouettes weigh the turn about it by `weight` of what they weigh the median motion by.
+    """
+    pivot, axis = transform_points(T, pair.centroid[None])[0], twist[3:]
+    across = torch.eye(3).to(T) - axis.outer(axis)
+    tilt = torch.cat([skew(pivot) @ across, across])
+    shift = pair.radius * torch.cat([across, torch.zeros_like(across)])
+    return weight / ASTRAY**2 * (tilt @ tilt.mT + shift @ shift.mT)
+
+
+def _unseen_turns(pair: PartPair, T: Tensor, half_blind: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Twists [K, 6] of unit rotation, in the target's world, of the turns to which the silhouettes are blind, or half.
 
-    And the share of rotation [K] in the motions that these are of.
+    And the share of rotation [K] in the motions that these are of, and what silhouettes weigh these by, the median
+    motion by 1 [K].
     """
     silhouettes = replace(pair, chroma_weight=0.0, brightness_weight=0.0)
     weights, motions = torch.linalg.eigh(normal_equations(silhouettes, T, 6).H.sum(0))
@@ -152,11 +169,11 @@ def _unseen_turns(pair: PartPair, T: Tensor, half_blind: bool) -> tuple[Tensor, 
     blind = (weights < BLIND * weights[3]) & (shares > MOSTLY)
     if half_blind:
         blind[0] |= (weights[0] < HALF_BLIND * weights[3]) & (shares[0] > NEARLY_ALL)
-    motions, shares = motions.mT[blind], shares[blind]
+    motions, shares, weights = motions.mT[blind], shares[blind], weights[blind] / weights[3]
     shift, axes = pair.radius * motions[:, :3] / shares[:, None], motions[:, 3:] / shares[:, None]
     shift = shift - (shift * axes).sum(-1, keepdim=True) * axes
     pivot = transform_points(T, pair.centroid[None])
-    return torch.cat([shift + torch.linalg.cross(pivot.expand_as(axes), axes), axes], -1), shares
+    return torch.cat([shift + torch.linalg.cross(pivot.expand_as(axes), axes), axes], -1), shares, weights
 
 
 def _axis_of_symmetry(pair: PartPair, T: Tensor, guess: Tensor) -> Tensor | None:

@@ -5,7 +5,7 @@ import pytest
 import torch
 from part_scene import angle_deg, box, disc, inverse, motion, photograph
 
-from splatart_ns.geometry.se3 import se3_exp
+from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, se3_exp
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import pose_evidence, symmetry
 from splatart_ns.stages.joint import fit_joint
@@ -119,7 +119,7 @@ def test_the_turn_of_a_round_part_that_is_hidden_in_part_is_untold(under_a_fork,
 def test_silhouettes_are_blind_to_turns_that_they_hardly_weigh(plain, monkeypatch, weights, half_blind, told):
     H = torch.tensor(weights).double().diag()
     monkeypatch.setattr(symmetry, "normal_equations", lambda *_: NormalEquations(H[None], torch.zeros(1, 6), 0.0))
-    twists, shares = symmetry._unseen_turns(part_pair(*plain, 2, VIEWS, 400), EYE, half_blind)
+    twists, shares, weights = symmetry._unseen_turns(part_pair(*plain, 2, VIEWS, 400), EYE, half_blind)
     assert len(twists) == told and torch.allclose(shares, torch.ones(told).double())
     if told:
         assert torch.allclose(twists[0, 3:].abs(), torch.tensor([0.0, 1.0, 0.0]).double())
@@ -149,9 +149,23 @@ def about(axis, centre=TILT[:3, 3]):
 def test_a_wheel_that_is_hardly_round_may_have_turned(under_a_fork, hardly_round):
     settled, untold = settle_turn(*under_a_fork, 2, EYE)
     assert torch.equal(settled, EYE)
-    assert float(untold[3:, 3:].trace()) == pytest.approx(math.pi**2 / 3, rel=1e-6)
+    tilt, _, turn = torch.linalg.eigvalsh(untold[3:, 3:])
+    assert float(turn) == pytest.approx(math.pi**2 / 3, rel=1e-6)
+    assert math.radians(0.3) ** 2 < float(tilt) < math.radians(5) ** 2
     twist = torch.linalg.eigh(untold).eigenvectors[:, -1]
     assert abs(float(twist[3:] @ TILT[:3, 2]) / float(twist[3:].norm())) > math.cos(math.radians(3))
+
+
+def test_an_axis_may_be_as_far_astray_as_silhouettes_weigh_turns_about_it(plain):
+    pair, axis = part_pair(*plain, 2, VIEWS, 400), TILT[:3, 2]
+    carried = motion((0, 0, 0), (0.5, 0, 0))
+    centre = pair.centroid + carried[:3, 3]
+    spread = symmetry._astray(pair, carried, about(axis, centre), torch.tensor(0.09).double())
+    to_centre = adjoint(from_rotation_translation(torch.eye(3).double(), -centre))
+    spread, across = to_centre @ spread @ to_centre.mT, torch.eye(3).double() - axis.outer(axis)
+    assert torch.allclose(spread[3:, 3:], 0.01 * across)
+    assert torch.allclose(spread[:3, :3], 0.01 * pair.radius**2 * across)
+    assert torch.allclose(spread[:3, 3:], torch.zeros(3, 3).double(), atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -160,13 +174,15 @@ def test_a_wheel_that_is_hardly_round_may_have_turned(under_a_fork, hardly_round
 def test_of_several_axes_or_one_that_misses_it_none_is_a_hardly_round_parts(
     under_a_fork, hardly_round, monkeypatch, axes, share, untold
 ):
-    found = torch.stack([about(TILT[:3, k]) for k in axes]), torch.full((len(axes),), share)
+    found = torch.stack([about(TILT[:3, k]) for k in axes]), *torch.full((2, len(axes)), share)
     monkeypatch.setattr(symmetry, "_unseen_turns", lambda *_: found)
     assert bool(settle_turn(*under_a_fork, 2, EYE)[1].any()) == untold
 
 
 def test_a_bar_whose_turn_silhouettes_hardly_tell_rests(hardly_round, monkeypatch):
-    monkeypatch.setattr(symmetry, "_unseen_turns", lambda *_: (about(TILT[:3, 2])[None], torch.ones(1)))
+    monkeypatch.setattr(
+        symmetry, "_unseen_turns", lambda *_: (about(TILT[:3, 2])[None], torch.ones(1), 0.1 * torch.ones(1))
+    )
     settled, untold = settle_turn(*scene(tilted_box, EYE, size=(0.2, 0.2, 0.8)), 2, EYE)
     assert torch.equal(settled, EYE) and not untold.any()
 
@@ -175,7 +191,7 @@ def test_what_tells_that_a_hardly_round_part_rests_may_show_in_some_of_the_views
     under_a_fork, hardly_round, monkeypatch
 ):
     asked = []
-    monkeypatch.setattr(symmetry, "_unseen_turns", lambda *_: (about(TILT[:3, 2])[None], torch.ones(1)))
+    monkeypatch.setattr(symmetry, "_unseen_turns", lambda *_: (about(TILT[:3, 2])[None], torch.ones(1), torch.ones(1)))
     monkeypatch.setattr(symmetry, "_rests", lambda pair, *_: asked.append(pair) or len(asked) == 2)
     assert not settle_turn(*under_a_fork, 2, EYE)[1].any()
     assert len(asked[0].views[0]) == VIEWS < len(asked[1].views[0])
