@@ -57,6 +57,9 @@ _PARALLEL, _ASTRAY = 0.98, 0.004
 than the second, as a share of the object's radius, goes along it, too: so short a one goes where the poses err."""
 _ONE_LINE = 0.1
 """How far such hinges may lie apart, as a share of the object's radius."""
+_TURNED_BACK = 0.1
+"""And besides, of such a hinge, where its parent turned further on the root than the child, which then turned back on
+it: of a stapler's three parts about one pin, that in the middle turned by less than the last."""
 _IN_TOUCH = 0.1
 """Largest gap of two parts of a group that only a free joint carries, as a share of the object's radius."""
 
@@ -272,6 +275,8 @@ def _stacked(
         apart = torch.linalg.cross(origins[:, None] - origins, axes.expand(len(fits), -1, -1)).norm(dim=-1)
         if bool((apart > _ONE_LINE * object_radius).any()):
             return _STACKED
+        parent_turned, child_turned = (fit.values.abs().max() for fit in on_root)
+        return _STACKED_ALIKE + (_TURNED_BACK if parent_turned > child_turned else 0)
     return _STACKED_ALIKE
 
 

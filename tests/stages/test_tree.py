@@ -454,6 +454,21 @@ def test_of_two_drawers_that_slid_nearly_alike_none_slides_aside_on_the_other(as
 
 
 @pytest.mark.parametrize(
+    "turns, parents", [((0.9, 1.8), {2: 1, 3: 2}), ((1.8, 0.9), {2: 3, 3: 1}), ((-0.9, 1.8), {2: 1, 3: 2})]
+)
+def test_of_three_in_a_row_about_one_pin_that_in_the_middle_turned_less_than_the_last(turns, parents):
+    """A stapler's base, magazine and cover, of which contact tells next to nothing: here for the other order."""
+
+    def turn(value):
+        return JointFit("revolute", X, 0 * X, 0.0, torch.tensor([0.0, value]).double(), residual=0.0)
+
+    joints = {(1, 2): turn(turns[0]), (1, 3): turn(turns[1]), (2, 3): turn(turns[1] - turns[0])}
+    gaps = {(1, 2): 0.43, (1, 3): 0.43, (2, 3): 0.305}
+    gaps[1, 2 if abs(turns[0]) > abs(turns[1]) else 3] -= 0.015
+    assert parents_found(joints, gaps) == parents
+
+
+@pytest.mark.parametrize(
     "axis, closer, parent",
     [(Y, 0.07, 1), (Y, 0.15, 2), (Z, 0.07, 2)],
     ids=["parallel", "parallel, much closer", "not parallel"],
