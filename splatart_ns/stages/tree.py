@@ -47,7 +47,8 @@ _STACKED_ALIKE = 0.1
 hinge whose axis its parent and the child itself turn about on the root, as doors above each other do. It says nothing
 that the other two do not, and a drawer shows where it nears its neighbour but not where it touches the body. And that
 of a part that is nearly fixed to such a one, but not quite: both moved by about as much. And that of a slide between
-two parts that turn about parallel lines on the root: from one state to another by the same angle."""
+two parts that turn about parallel lines on the root: from one state to another by the same angle. And that of two that
+rest on the root, but may have turned, as knobs beside each other: what is behind them nobody sees."""
 _NOT_QUITE, _OF_MOTION = 0.002, 0.15
 """Least residual of such a fixed joint, as a share of the object's radius: a handle's on its door is as small as the
 errors of poses are; of two of a desk's seven drawers it was 0.0028. Or as a share of what a fixed joint to the root
@@ -263,6 +264,8 @@ def _stacked(
     if not_quite_fixed or by_one_angle:
         fits = on_root
     kinds = {fit.type for fit in fits}
+    if kinds == {"fixed"} and all(fit.ambiguous for fit in on_root):
+        return _STACKED_ALIKE
     if kinds not in ({"prismatic"}, {"revolute"}):
         return _STACKED
     if kinds == {"prismatic"} and _leads_aside(between, on_root[0].axis) < _ASTRAY * object_radius:

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -466,6 +467,18 @@ def test_of_three_in_a_row_about_one_pin_that_in_the_middle_turned_less_than_the
     gaps = {(1, 2): 0.43, (1, 3): 0.43, (2, 3): 0.305}
     gaps[1, 2 if abs(turns[0]) > abs(turns[1]) else 3] -= 0.015
     assert parents_found(joints, gaps) == parents
+
+
+@pytest.mark.parametrize("in_doubt, parent", [((2, 3), 1), ((3,), 2), ((2,), 2), ((), 2)])
+def test_of_two_knobs_that_seem_to_rest_none_hangs_on_the_other_but_one_on_a_door_does(in_doubt, parent):
+    """Part 3 is nearer to part 2 than to what is seen of the root; those `in_doubt` may have turned unseen."""
+
+    def fixed(child):
+        fit = JointFit("fixed", 0 * X, 0 * X, 0.0, torch.zeros(2).double(), residual=0.0)
+        return replace(fit, ambiguous=child in in_doubt)
+
+    joints = {(1, 2): fixed(2), (1, 3): fixed(3), (2, 3): fixed(3)}
+    assert parents_found(joints, {(1, 2): 0.02, (1, 3): 0.12, (2, 3): 0.05}) == {2: 1, 3: parent}
 
 
 @pytest.mark.parametrize(
