@@ -51,7 +51,8 @@ def unevenness(gains: Tensor, views: Sequence[View]) -> float:
     two may show what the splat has not learned yet, as a blade from its edge. So it is that of what is left, told by
     the median of its absolute values (Hampel 1974, "The influence curve and its role in robust estimation").
     """
-    logs = gains.log()
+    # On the CPU, where least squares need no full rank: views from one height have none.
+    logs = gains.log().cpu()
     viewmats = torch.stack([view.viewmat for view in views]).to(logs)
     terms = torch.ones_like(logs[:, :1])
     if len(views) >= FRAMES:

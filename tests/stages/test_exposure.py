@@ -70,6 +70,12 @@ def test_light_from_one_side_does_not_make_frames_uneven(scene):
     assert unevenness(light.exp()[:, None].expand(-1, 3), views) < 1e-3
 
 
+def test_frames_all_from_one_direction_are_as_uneven_as_their_gains(scene):
+    views = 20 * scene[1][:1]
+    logs = 0.15 * torch.randn(len(views), 3, generator=torch.Generator().manual_seed(0))
+    assert unevenness(logs.exp(), views) == pytest.approx(0.15, rel=0.25)
+
+
 def test_a_frame_that_shows_what_is_not_learned_yet_does_not_make_the_others_uneven(scene):
     views = 2 * scene[1]
     gains = torch.ones(len(views), 3)
