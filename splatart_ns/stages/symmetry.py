@@ -46,7 +46,7 @@ least."""
 ASTRAY = 3.0
 """About an axis off a round part's own by an angle or, in radii, a shift e, silhouettes weigh a turn by about e^2 of
 what they weigh the median motion by. So e is at most the root of that share, which is taken for so many standard
-deviations: 25 such axes were off by 0.1 to 2.4 of these, one by 4."""
+deviations: 25 such axes were off by 0.1 to 2.5 of these, one by 4."""
 UNMOVED = 0.1
 """Radii by which the centroid of a part that seems to rest may have moved. Of a drawer that slid out one state may hide
 so much that nothing fits well, and turned by 15 degrees it costs a mere 1 to 55 % more (20 drawers of five objects)."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatart_ns.plugin import semantic
 from splatart_ns.plugin.semantic_run import learned_views
 from splatart_ns.stages.camera_refinement import PASSES
 from splatart_ns.stages.hull import Slack
@@ -119,6 +120,16 @@ def test_depth_that_contradicts_itself_is_told_and_not_used(depth_capture_dir, s
     assert pipeline.findings["depth"]["confirmed"] < 0.3
     pipeline.model.step_cb(trainer.optimizers, 0)
     assert float(pipeline.get_train_loss_dict(0)[1]["depth"]) == 0
+
+
+@pytest.mark.parametrize(("uneven", "evened"), [(0.06, False), (0.16, True)])
+def test_frames_are_evened_where_their_gains_are_uneven(capture_dir, semantic_trainer, monkeypatch, uneven, evened):
+    pipeline = semantic_trainer(capture_dir, steps=301, semantic_start=300).pipeline
+    pipeline.model.gauss_params["opacities"].data.fill_(5)
+    monkeypatch.setattr(semantic, "unevenness", lambda gains, views: uneven)
+    for step in (60, 120, 180):
+        pipeline._even_exposures(step)
+    assert bool(pipeline.notes) == evened == bool((pipeline.model.gains != 1).any())
 
 
 def test_frames_of_different_exposures_are_evened_also_for_the_next_stage(capture_dir, semantic_trainer, tmp_path):

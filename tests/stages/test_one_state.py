@@ -20,7 +20,7 @@ from splatart_ns.stages.render_choice import (
 from splatart_ns.stages.visibility import looked_at
 
 PULLED = motion((0, 0, 0), (0, -0.5, 0))
-COVERING = motion((0, 0, 0), (0, -0.5, 0)) @ motion((30, 0, 0), (0, 0, 0))
+COVERING = PULLED @ motion((30, 0, 0), (0, 0, 0))
 """Lays the front over what is open."""
 SHOWN = 0.02
 
@@ -75,7 +75,7 @@ def test_the_shut_state_tells_that_a_drawer_slid_which_seems_turned_so_as_to_cov
     assert torch.allclose(slid.T[:3, 3], PULLED[:3, 3], atol=0.06)
 
 
-def test_the_state_that_shows_all_comes_second_when_it_comes_first(scene):
+def test_the_shut_state_tells_it_where_it_is_the_second_one_too(scene):
     splats, views, _ = (x[::-1] for x in scene)
     pairs = tuple(part_pair(splats, views, 2, 5, pixels) for pixels in (COARSE_PIXELS, FINE_PIXELS))
     pushed = torch.stack([torch.linalg.inv(PULLED), torch.linalg.inv(COVERING)])

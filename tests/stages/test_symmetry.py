@@ -119,10 +119,11 @@ def test_the_turn_of_a_round_part_that_is_hidden_in_part_is_untold(under_a_fork,
 def test_silhouettes_are_blind_to_turns_that_they_hardly_weigh(plain, monkeypatch, weights, half_blind, told):
     H = torch.tensor(weights).double().diag()
     monkeypatch.setattr(symmetry, "normal_equations", lambda *_: NormalEquations(H[None], torch.zeros(1, 6), 0.0))
-    twists, shares, weights = symmetry._unseen_turns(part_pair(*plain, 2, VIEWS, 400), EYE, half_blind)
+    twists, shares, least = symmetry._unseen_turns(part_pair(*plain, 2, VIEWS, 400), EYE, half_blind)
     assert len(twists) == told and torch.allclose(shares, torch.ones(told).double())
     if told:
         assert torch.allclose(twists[0, 3:].abs(), torch.tensor([0.0, 1.0, 0.0]).double())
+        assert float(least[0]) == pytest.approx(sorted(weights)[0] / sorted(weights)[3])
 
 
 def test_silhouettes_are_blind_to_a_turn_that_also_shifts_only_if_they_hardly_weigh_it(plain, monkeypatch):
