@@ -12,6 +12,8 @@ PRESETS = {"draft": 1.0, "standard": 2.5, "high": 9.0}
 """Qualities, and about how many times the draft's seconds they take."""
 SLOW = 1.6
 """Of pose descent and of another rasterizer, the same."""
+SLOW_GROUPS = "poses", "joints", "rasterizer", "labelled frames"
+"""What takes two to four times as long as the other settings."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ class Extent:
     labelled: tuple[float, ...]
     """Shares of the views with labels."""
     slow_everywhere: bool
-    """Whether the slowest preset and joints by descent run on every object, or on the first alone."""
+    """Whether `high` and the groups of `SLOW_GROUPS` run on every object, or on the first alone."""
     growths: dict[str, tuple[int, ...]]
 
 
@@ -136,7 +138,7 @@ def trade_offs(extent: Extent, given: list[Path]) -> list[Point]:
         for scene in scenes:
             turn = settings_on(scene, seed, extent)
             if scene is not scenes[0] and not extent.slow_everywhere:
-                turn = [point for point in turn if point.quality != "high" and point.group != "joints"]
+                turn = [point for point in turn if point.quality != "high" and point.group not in SLOW_GROUPS]
             random.Random(f"{seed} {scene.name}").shuffle(turn)
             points += turn
     return points

@@ -251,8 +251,11 @@ def refined(coarse: PartPair, fine: PartPair, candidates: Tensor) -> list[Refine
     If the best turns the part over, a mere shift to the same place comes last, for `prefer_slide`.
     """
     if len(candidates) > 1:
-        near = torch.stack([refine(coarse, T, 5).T for T in candidates])
-        candidates = choose(coarse, near, 1.5, own=own_appearance(coarse))
+        near = [refine(coarse, T, 5) for T in candidates]
+        least = min(near, key=lambda end: end.cost)
+        half_turn = so3_log(least.T[:3, :3]).norm() > HALF_TURN  # to which `prefer_less_turn` may prefer dearer ones
+        times = DOUBTFUL if half_turn else 1.5
+        candidates = choose(coarse, torch.stack([end.T for end in near]), times, own=own_appearance(coarse))
     ends = [refine(fine, T, 10) for T in candidates]
     best = min(ends, key=lambda end: end.cost)
     return [*ends, shifted(fine, best.T)] if so3_log(best.T[:3, :3]).norm() > TURNED_OVER else ends

@@ -9,6 +9,7 @@ from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.registration import part_points, register
 from splatart_ns.stages.render_choice import (
     ALIKE,
+    COARSE_PIXELS,
     DOUBTFUL,
     FINE_PIXELS,
     SHADED_RATIO,
@@ -241,25 +242,43 @@ def test_less_than_half_a_turn_is_preferred_to_the_part_turned_over(turn, over, 
     assert prefer_less_turn(T, np.array([1.0, cost]), order)[0] == int(preferred)
 
 
-def test_a_lid_that_is_lit_from_one_side_is_not_turned_over():
-    """Opened it is lit from below, so that it fits better turned over, though its sides have another colour each."""
-    T = motion((60, 0, 0), (0.0, 0.1, 0.3))
+OPENED = motion((60, 0, 0), (0.0, 0.1, 0.3))
+
+
+def lit_lid(colour):
+    """Opened it is lit from below, so that it fits better turned over, though its sides differ by twice a colour."""
     lid = box(1, (0.6, 0.4, 0.06), (0.0, 0.0, 0.0), spacing=0.04)
     above, front = lid.means[:, 2, None, None] > 0, lid.means[:, 1, None, None] > 0.1
-    colour = torch.where(above, 0.2, -0.2) * torch.tensor([1.0, -0.5, -0.5])
-    colour = colour + torch.where(front, 0.4, 0.0) * torch.tensor([-0.5, 1.0, -0.5])
-    opened = lid.transformed(T)
-    lid.sh, opened.sh = (torch.where(lit, 0.5, -0.1) + colour for lit in (above, ~above))
+    colours = torch.where(above, colour, -colour) * torch.tensor([1.0, -0.5, -0.5])
+    colours = colours + torch.where(front, 0.4, 0.0) * torch.tensor([-0.5, 1.0, -0.5])
+    opened = lid.transformed(OPENED)
+    lid.sh, opened.sh = (torch.where(lit, 0.5, -0.1) + colours for lit in (above, ~above))
     splats = lid, opened
-    views = tuple(photograph(s, count=20) for s in splats)
+    return splats, tuple(photograph(s, count=20) for s in splats)
+
+
+def test_a_lid_that_is_lit_from_one_side_is_not_turned_over():
+    splats, views = lit_lid(0.2)
     seen = tuple(visibility(s, v) for s, v in zip(splats, views, strict=True))
     found = initial_motion(splats, views, seen, part=1)
-    assert angle_deg(found.T, T) < 2
-    (over,) = found.alike
-    assert angle_deg(over, T) > 170
+    assert angle_deg(found.T, OPENED) < 2
+    over = found.alike[0]
+    assert angle_deg(over, OPENED) > 170
     pair = part_pair(splats, views, 1, VIEWS, FINE_PIXELS)
     right, turned_over = appearance_cost(pair, torch.stack([found.T, over]))
     assert ALIKE * turned_over < right < DOUBTFUL * turned_over
+
+
+def test_a_lid_stays_in_view_that_fits_much_worse_than_turned_over():
+    splats, views = lit_lid(0.18)
+    coarse, fine = (part_pair(splats, views, 1, VIEWS, pixels) for pixels in (COARSE_PIXELS, FINE_PIXELS))
+    flip = motion((0, 180, 0), (0, 0, 0))
+    flip[:3, 3] = coarse.centroid - flip[:3, :3] @ coarse.centroid
+    over = OPENED @ flip
+    right, turned_over = appearance_cost(coarse, torch.stack([OPENED, over]))
+    assert 1.5 * turned_over < right < DOUBTFUL * turned_over
+    T, cost, order = ranked(fine, refined(coarse, fine, torch.stack([OPENED, over])))
+    assert angle_deg(torch.from_numpy(T[order[0]]), OPENED) < 1
 
 
 def test_where_all_candidates_turn_the_part_over_a_mere_shift_is_tried():
