@@ -1,8 +1,8 @@
-"""Brightness of renderings and images, compared as if both were lit alike.
+"""Colours of renderings and images, compared as if both were lit alike.
 
 Light stays in the world while parts turn, so a moved part is rendered brighter here and darker there than it is. Where
 surfaces are smooth, light changes slowly over the image, and edges, prints and creases stay sharp whatever the light:
-what is left of the brightness once its mean over a few pixels agrees says where the part is, also of a grey one.
+once the mean brightness over a few pixels agrees, what is left says where the part is, also of a grey one.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ MOST = 3.0
 """A light is at most so many times brighter or darker than the other."""
 
 
-def difference_in_even_light(rgba: Tensor, wanted: Tensor, weight: Tensor) -> Tensor:
-    """How much brighter pictures [K, H, W, 4] are than the `wanted` one [H, W, 4], once lit as that is [K, H, W, 1].
+def in_even_light(rgba: Tensor, wanted: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Pictures [K, H, W, 4] lit as the `wanted` one [H, W, 4] is, and how far inside both silhouettes pixels lie
+    [K, H, W], 0..1: towards the edges means have little to go by.
 
-    Both are colours over black with their silhouettes, 0..1. Pixels of `weight` [H, W] 0 count in no mean. Towards the
-    silhouettes, where means have little to go by, the difference fades.
+    All are colours over black with their silhouettes, 0..1. Pixels of `weight` [H, W] 0 count in no mean.
     """
-    bright, shown, light = _lit(rgba, weight)
-    bright_wanted, shown_wanted, light_wanted = _lit(wanted[None], weight)
+    shown, light = _lit(rgba, weight)
+    shown_wanted, light_wanted = _lit(wanted[None], weight)
     gain = (light_wanted / light).clamp_(1 / MOST, MOST)
-    return gain.mul_(bright).sub_(bright_wanted).mul_(shown).mul_(shown_wanted)[..., None]
+    return rgba * pad(gain[..., None].expand(*gain.shape, 3), (0, 1), value=1.0), shown.mul_(shown_wanted)
 
 
-def _lit(rgba: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of pictures [K, H, W, 4] their brightness, how much of the part is around, and how it is lit there: [K, H, W]."""
+def _lit(rgba: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Of pictures [K, H, W, 4] how much of the part is around, and how it is lit there: [K, H, W]."""
     bright = rgba @ torch.tensor([1 / 3, 1 / 3, 1 / 3, 0]).to(rgba)
     around, shown = _mean(torch.stack([bright, rgba[..., 3]]).mul_(weight))
-    return bright, shown, (around / (shown + DARK)).add_(DARK)
+    return shown, (around / (shown + DARK)).add_(DARK)
 
 
 def _mean(x: Tensor) -> Tensor:

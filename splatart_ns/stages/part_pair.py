@@ -16,7 +16,7 @@ from splatart_ns.geometry.se3 import inverse
 from splatart_ns.geometry.similarity import inverse_similarity, view_of_moved
 from splatart_ns.rasterize.rasterization import rasterization, rasterize_neighbours, sh_colors
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.light import difference_in_even_light
+from splatart_ns.stages.light import in_even_light
 from splatart_ns.threads import side_by_side
 
 Measure = TypeVar("Measure")
@@ -89,12 +89,17 @@ class PartView:
     ) -> Tensor:
         """How the splat under motions [K, 4, 4] differs from the part [K, H, W, 4]; see `render`."""
         rendered = self.render(splat, T, first_order)
+        inside = None
+        if even_light:
+            rendered, inside = in_even_light(rendered, self.rgba, self.weight)
+        change = rendered - self.rgba
         mean = torch.full((3, 3), 1 / 3).to(rendered)
         mix = torch.eye(4).to(rendered)  # by a matrix: sums over channels take several times longer
         mix[:3, :3] = chroma_weight * (mix[:3, :3] - mean) + (0 if even_light else brightness_weight) * mean
-        difference = (rendered - self.rgba) @ mix
-        if even_light:
-            difference[..., :3] += brightness_weight * difference_in_even_light(rendered, self.rgba, self.weight)
+        difference = change @ mix
+        if inside is not None:
+            brighter = change @ F.pad(mean[0], (0, 1))
+            difference[..., :3] += inside.mul_(brightness_weight).mul_(brighter)[..., None]
         return difference
 
 

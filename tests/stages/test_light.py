@@ -3,7 +3,13 @@
 import pytest
 import torch
 
-from splatart_ns.stages.light import difference_in_even_light
+from splatart_ns.stages.light import in_even_light
+
+
+def difference_in_even_light(rgba: torch.Tensor, wanted: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """How much brighter pictures are, inside the silhouettes [K, H, W, 1]."""
+    lit, inside = in_even_light(rgba, wanted, weight)
+    return ((lit - wanted)[..., :3].mean(-1) * inside)[..., None]
 
 
 def grey(brightness: torch.Tensor, alpha: torch.Tensor | None = None) -> torch.Tensor:
@@ -32,6 +38,17 @@ def test_how_brightly_a_surface_is_lit_makes_no_difference(prints, gain):
     found = difference_in_even_light(grey(ramp * prints)[None], grey(prints), torch.ones(40, 40))
     assert found[INSIDE].abs().max() < 0.02
     assert ((ramp - 1) * prints).abs().max() > 0.15
+
+
+@pytest.mark.parametrize("gain", [0.6, 1.5])
+def test_nor_does_it_in_any_colour(prints, gain):
+    ramp = torch.linspace(1.0, gain, 40)
+    yellow = grey(prints) * torch.tensor([1.0, 0.8, 0.1, 1.0])
+    for light in (torch.full((40,), gain), ramp):
+        other = torch.cat([yellow[..., :3] * light[:, None], yellow[..., 3:]], -1)
+        lit, _ = in_even_light(other[None], yellow, torch.ones(40, 40))
+        inside = (lit - yellow)[:, 8:-8, 8:-8]
+        assert inside.abs().max() < 0.03 < (other - yellow)[8:-8, 8:-8].abs().max()
 
 
 def test_a_print_that_is_elsewhere_makes_one_under_any_light(prints):

@@ -2,9 +2,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from part_scene import motion, two_states
+from part_scene import motion, photograph, two_states
 
-from splatart_ns.stages.part_pair import CHROMA_WEIGHT, best_views, part_pair, part_view
+from splatart_ns.geometry.spherical_harmonics import SH_C0
+from splatart_ns.stages.part_pair import CHROMA_WEIGHT, IN_EVEN_LIGHT, best_views, part_pair, part_view
 
 EYE = torch.eye(4, dtype=torch.float64)
 
@@ -115,3 +116,20 @@ def test_a_change_of_hue_counts_for_more_than_one_of_brightness(scene):
     assert change(redder) == pytest.approx(float(change(brighter)), rel=1e-3)
     assert change(redder, chroma_weight=CHROMA_WEIGHT) > 6 * change(brighter, chroma_weight=CHROMA_WEIGHT)
     assert change(brighter, chroma_weight=CHROMA_WEIGHT) == pytest.approx(float(change(brighter)), rel=1e-3)
+
+
+def test_in_even_light_colours_that_are_darker_alike_cost_no_more_than_grey_ones(scene):
+    """A saturated colour that is lit less has less of its hue, too."""
+    (splat, other), views = scene
+    T = motion((0, 0, 25), (0.3, 0.0, 0.0))[None]
+    costs = {}
+    for name, colour in (("grey", (0.7, 0.7, 0.7)), ("yellow", (0.9, 0.7, 0.0))):
+        plain = ((torch.tensor(colour) - 0.5) / SH_C0).expand(len(splat), 1, 3)
+        dark = ((0.6 * torch.tensor(colour) - 0.5) / SH_C0).expand(len(splat), 1, 3)
+        splats = replace(splat, sh=plain), replace(other, sh=dark)
+        pair = part_pair(splats, tuple(photograph(s) for s in splats), 2, num_views=3, pixels=400)
+        even = replace(pair, **IN_EVEN_LIGHT)
+        costs[name] = float(even.cost(T)[0]), float(replace(even, even_light=False).cost(T)[0])
+    even, uneven = zip(*costs.values(), strict=True)
+    assert even[1] < 3 * even[0]
+    assert even[1] < 0.1 * uneven[1]
