@@ -48,6 +48,8 @@ BESIDE = 0.5
 """Poses of parts with more than this share of their border against others learn along with merged Gaussians."""
 RATES = 1e-3, 2e-5
 """Of these poses, in the first and in the last step; radians and radii of the part."""
+MOST = 3.0
+"""By so many standard deviations at most."""
 WELL_KNOWN = 0.01
 """Their largest standard deviation, in radians and radii: others would be led by single views."""
 
@@ -368,6 +370,10 @@ class PosePipeline(VanillaPipeline):
         def count(step: int) -> None:
             self.model.step = step
 
+        def hold(step: int) -> None:
+            if self.model.merged and self.model.poses.free.any():
+                self.model.poses.hold_within(self.model.covariance, MOST)
+
         def finish(step: int) -> None:
             if step == steps - 1:
                 self.model.poses.commit(self.model.poses.T())
@@ -376,7 +382,7 @@ class PosePipeline(VanillaPipeline):
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         return [
             *(TrainingCallback(before, function) for function in (merge, thin, slow_down, count)),
-            TrainingCallback(after, finish),
+            *(TrainingCallback(after, function) for function in (hold, finish)),
         ]
 
     @torch.no_grad()

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.view import View
-from splatart_ns.geometry.se3 import from_rotation_translation, inverse, so3_exp, transform_points
+from splatart_ns.geometry.se3 import from_rotation_translation, inverse, skew, so3_exp, transform_points
 from splatart_ns.rasterize.render import Rendering
 from splatart_ns.rasterize.ssim import ssim
 from splatart_ns.splats.splat import Splat
@@ -20,6 +20,8 @@ PURE = 0.9
 """A Gaussian more likely than this of one part is not mixed."""
 KEPT = 0.9
 """At least this share of a part's Gaussians is kept, however mixed."""
+SINGULAR = 1e-9
+"""Variances below this share of a pose's largest one are none."""
 
 
 class PartPoses(nn.Module):
@@ -73,6 +75,27 @@ class PartPoses(nn.Module):
         """Let just the poses `free` [S, P] bool change, those not `turning` [S, P] bool by shifts alone."""
         self.free.copy_(free[1:])
         self.turning.copy_(turning[1:])
+
+    @torch.no_grad()
+    def hold_within(self, covariance: Tensor, deviations: float) -> None:
+        """Shorten increments of free poses that are more than so many standard deviations long.
+
+        By the base poses' covariances [S, P, 6, 6], T = se3_exp(xi) T_true, xi = (translation, rotation); along what
+        these leave no room for, increments count for nothing.
+        """
+        free = self.free
+        centroids, radii = (x.expand(len(free), *x.shape)[free] for x in (self.centroids, self.radii))
+        pivot = transform_points(self.base[1:][free], centroids[:, None])[:, 0]
+        eye = torch.eye(3).to(pivot).expand(len(pivot), 3, 3)
+        to_increment = torch.cat(
+            [torch.cat([eye, -skew(pivot)], -1) / radii[:, None, None], torch.cat([torch.zeros_like(eye), eye], -1)], -2
+        )
+        C = to_increment @ covariance[1:][free] @ to_increment.mT
+        increment = torch.cat([self.translation[free], self.rotation[free]], -1)
+        precision = torch.linalg.pinv(C, rtol=SINGULAR, hermitian=True)
+        length = (increment[:, None] @ precision @ increment[..., None])[:, 0].clamp_min(0).sqrt()
+        shorter = increment * (deviations / length.clamp_min(deviations))
+        self.translation[free], self.rotation[free] = shorter[:, :3], shorter[:, 3:]
 
 
 def part_extents(splat: Splat, num_parts: int) -> tuple[Tensor, Tensor]:

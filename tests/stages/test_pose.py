@@ -2,6 +2,7 @@ import pytest
 import torch
 from part_scene import angle_deg, box, motion, nearby, photograph, two_states
 
+from splatart_ns.geometry.se3 import se3_log
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
@@ -82,6 +83,43 @@ def test_released_poses_change_and_what_slides_does_not_turn():
     unturned = torch.isclose(change[..., :3, :3], EYE[:3, :3]).flatten(2).all(-1)
     assert still.tolist() == [[True, True], [False, False], [True, True]]
     assert unturned.tolist() == [[True, True], [False, True], [True, True]]
+
+
+def deviations(p: PartPoses, covariance: torch.Tensor) -> torch.Tensor:
+    """How many standard deviations the poses are from their bases [S - 1, P]."""
+    xi = se3_log(p.T()[1:].detach() @ p.base[1:].inverse())
+    return (xi[..., None, :] @ torch.linalg.pinv(covariance[1:]) @ xi[..., None])[..., 0, 0].sqrt()
+
+
+def test_poses_are_held_within_so_many_standard_deviations():
+    g = torch.Generator().manual_seed(3)
+    errors = 5e-5 * torch.randn(3, 2, 6, 20, generator=g).double()
+    covariance = errors @ errors.mT / 20
+    p = poses()
+    with torch.no_grad():
+        for parameter in p.parameters():
+            parameter.copy_(1e-3 * torch.randn(parameter.shape, generator=g).double())
+            parameter[1, 1] *= 1e-4
+    before, far = [x.detach().clone() for x in p.parameters()], deviations(p, covariance)
+    assert (far > 3).tolist() == [[True, True], [True, False]]
+    p.hold_within(covariance, 3.0)
+    assert torch.allclose(deviations(p, covariance), far.clamp_max(3), rtol=1e-2)
+    for held, parameter in zip(p.parameters(), before, strict=True):
+        assert torch.equal(held[1, 1], parameter[1, 1])
+        share = (3 / far)[0, 0]
+        assert torch.allclose(held[0, 0], share * parameter[0, 0], rtol=1e-2)
+
+
+def test_of_what_is_known_not_to_turn_shifts_alone_are_held():
+    covariance = torch.zeros(3, 2, 6, 6, dtype=torch.float64)
+    covariance[..., :3, :3] = 1e-6 * torch.eye(3)
+    p = poses()
+    released = torch.tensor([[False, False], [True, True], [False, False]])
+    p.release(released, ~released)
+    with torch.no_grad():
+        p.translation[..., 0] = torch.tensor([0.01, 0.01])
+    p.hold_within(covariance, 3.0)
+    assert p.translation[0, :, 0].tolist() == pytest.approx([0.003, 0.01])
 
 
 def test_commit_keeps_the_poses_and_zeroes_the_increments():
