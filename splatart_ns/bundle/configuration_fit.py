@@ -20,6 +20,8 @@ from splatart_ns.stages.refinement import linearized
 _COARSE, _FINE = (5, 1500), (12, 10000)
 """Views of a part, and the number of its pixels in each, in the search and in the refinement."""
 _TURN_SAMPLES, _SLIDE_SAMPLES = 72, 61
+_CLOSER, _FINER = 2, 5
+"""How many times samples are taken again about the best, and how much closer to each other."""
 _MAX_ITERATIONS = 20
 _STEP = 2e-3
 """Forward differences: radians, and normalised lengths (the object has about unit size)."""
@@ -42,8 +44,8 @@ class ConfigurationFit:
 def fit_configuration(bundle: Bundle, views: Sequence[View], normalization: Normalization) -> ConfigurationFit:
     """Find the joint values at which the bundle's parts look like labelled views of one configuration.
 
-    Down the tree, each joint is swept over a full turn or its widened range (joints of several freedoms: over what was
-    observed), each part compared on its own pixels and the background; then all values together are refined by
+    Down the tree, each joint is swept over a full turn or its widened range, then about the best value (joints of several
+    freedoms: over what was observed), each part compared on its own pixels and the background; then all values together are refined by
     Levenberg-Marquardt. The root stays where it is at state 0.
 
     Args:
@@ -60,9 +62,13 @@ def fit_configuration(bundle: Bundle, views: Sequence[View], normalization: Norm
             continue
         parent = configured_motions(bundle, q)[joint.parent]
         values = sweep_values(joint)
-        motions = parent @ joint_motion(joint, values)
-        costs = _cost(splats[joint.child], coarse[joint.child], _to_normal(motions, normalization))
-        q[joint.name] = values[int(costs.argmin())]
+        # Closer and closer: what hangs on a part is looked for where that one is put.
+        for _ in range(1 if values.ndim > 1 else 1 + _CLOSER):
+            motions = parent @ joint_motion(joint, values)
+            costs = _cost(splats[joint.child], coarse[joint.child], _to_normal(motions, normalization))
+            q[joint.name] = values[int(costs.argmin())]
+            if values.ndim == 1:
+                values = q[joint.name] + (values[1] - values[0]) * torch.linspace(-1, 1, 2 * _FINER + 1).to(values)
 
     def motions_at(x: Tensor) -> dict[str, Tensor]:
         """Of a batch of all values [K, D]: T[part] [K, 4, 4] in the normalised world."""

@@ -70,6 +70,27 @@ def test_values_are_found_inside_and_beyond_the_observed_range(cabinet, door, kn
     torch.testing.assert_close(found.q["base_ball"], torch.tensor(q["base_ball"], dtype=D), atol=0.02, rtol=0)
 
 
+def test_the_last_part_of_a_chain_is_found_whose_values_all_lie_between_samples():
+    """A bar that looks much the same turned over shows its turn only where it is put exactly."""
+    places = [-0.8 + 0.3 * k for k in range(6)]
+    bars = [box(k + 1, (0.32, 0.08, 0.05), (x, 0.0, 0.0), spacing=0.04, num_parts=6) for k, x in enumerate(places)]
+    motion, covariance = torch.eye(4, dtype=D).repeat(2, 1, 1), torch.zeros(2, 6, 6, dtype=D)
+    axes = (0, 0, 1.0), (0, 1.0, 0), (0, 0, 1.0), (0, 1.0, 0), (1.0, 0, 0)
+    chain = Bundle(
+        parts=[Part(k + 1, f"{k}", in_capture(bar), motion, covariance) for k, bar in enumerate(bars)],
+        joints=[
+            joint("revolute", f"{k}", f"{k + 1}", axis, (places[k] + 0.15, 0.0, 0.0), [0.0, 0.7], (0.0, 0.7))
+            for k, axis in enumerate(axes)
+        ],
+        root="0",
+        states=["state_00", "state_01"],
+    )
+    q = {j.name: 0.35 + math.radians(2.4) for j in chain.joints}
+    found = fit_configuration(chain, views_of(chain, q), NORMALIZATION)
+    assert found.converged
+    assert [float(value) for value in found.q.values()] == pytest.approx(list(q.values()), abs=0.05)
+
+
 def test_a_wrong_joint_fits_worse(cabinet):
     """What the score of a held-out configuration is for: a slide cannot explain a turn."""
     views = views_of(cabinet, {"base_door": 0.6})
