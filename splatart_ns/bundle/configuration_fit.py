@@ -44,9 +44,9 @@ class ConfigurationFit:
 def fit_configuration(bundle: Bundle, views: Sequence[View], normalization: Normalization) -> ConfigurationFit:
     """Find the joint values at which the bundle's parts look like labelled views of one configuration.
 
-    Down the tree, each joint is swept over a full turn or its widened range, then about the best value (joints of several
-    freedoms: over what was observed), each part compared on its own pixels and the background; then all values together are refined by
-    Levenberg-Marquardt. The root stays where it is at state 0.
+    Down the tree, each joint is swept over a full turn or its widened range, then about the best value (joints of
+    several freedoms: over what was observed), each part compared on its own pixels and the background; then all values
+    together are refined by Levenberg-Marquardt. The root stays where it is at state 0.
 
     Args:
         bundle: The object.
