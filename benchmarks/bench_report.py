@@ -16,6 +16,8 @@ from tradeoffs import growth, paired_ratio, pareto_front
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.axis import Axis
+from matplotlib.ticker import MaxNLocator, NullLocator, ScalarFormatter
 
 Record = dict[str, Any]
 ERRORS = {
@@ -145,6 +147,13 @@ def fronts(records: Sequence[Record], error: str) -> dict[str, list[Record]]:
     return out
 
 
+def few_ticks(axis: Axis) -> None:
+    """Numbers as they are written, few enough to be read: seconds span less than two decades."""
+    axis.set_major_locator(MaxNLocator(6))
+    axis.set_major_formatter(ScalarFormatter())
+    axis.set_minor_locator(NullLocator())
+
+
 def trade_figure(records: Sequence[Record], path: Path) -> None:
     captures = list(dict.fromkeys(map(object_of, records)))
     figure, axes = plt.subplots(
@@ -156,6 +165,7 @@ def trade_figure(records: Sequence[Record], path: Path) -> None:
             own = [r for r in records if object_of(r) == capture]
             finite = [error_of(r, error) for r in own if 0 < error_of(r, error) < math.inf]
             ax.set(xscale="log", yscale="log", title=capture, xlabel="seconds", ylabel=title)
+            few_ticks(ax.xaxis)
             if not finite:
                 continue
             edge = 2 * max(finite)
@@ -253,6 +263,7 @@ def stage_figure(records: Sequence[Record], path: Path) -> None:
                 label=capture,
             )
         ax.set(xscale="log", yscale="log", title=stage, xlabel="seconds of the stage", ylabel=ERRORS[error])
+        few_ticks(ax.xaxis)
         ax.grid(alpha=0.3, lw=0.4)
     axes[0].legend(fontsize=6)
     figure.tight_layout()

@@ -49,7 +49,7 @@ BESIDE = 0.5
 RATES = 1e-3, 2e-5
 """Of these poses, in the first and in the last step; radians and radii of the part."""
 MOST = 3.0
-"""By so many standard deviations at most."""
+"""So many standard deviations at most these poses move: light counts in that loss, and leads them astray."""
 WELL_KNOWN = 0.01
 """Their largest standard deviation, in radians and radii: others would be led by single views."""
 
