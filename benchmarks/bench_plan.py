@@ -13,7 +13,7 @@ PRESETS = {"draft": 1.0, "standard": 2.5, "high": 9.0}
 SLOW = 1.6
 """Of pose descent and of another rasterizer, the same."""
 SLOW_GROUPS = "poses", "joints", "rasterizer", "labelled frames"
-"""What takes two to four times as long as the other settings."""
+"""What takes one and a half to five times as long as the other settings."""
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from nerfstudio.engine.trainer import Trainer
 
 from splatart_ns.capture.check import require_valid
 from splatart_ns.errors import InputError
-from splatart_ns.geometry.se3 import se3_exp
+from splatart_ns.geometry.se3 import se3_exp, so3_log
 from splatart_ns.method_configs.pose import method as pose_method
-from splatart_ns.plugin.pose import RATES
+from splatart_ns.plugin.pose import MOST, RATES
 from splatart_ns.stages.render_choice import InitialMotion
 from splatart_ns.stages.thinning import BUDGET, LARGEST_SHARE, ROUNDS
 from splatart_ns.stages.world import WorldFit
@@ -193,7 +193,8 @@ def test_merged_gaussians_that_the_images_hardly_miss_go_and_the_report_tells(po
 def test_well_known_poses_of_parts_against_others_learn_with_merged_gaussians(
     pose_trainer, monkeypatch, beside, deviation, turning, frozen, shifts, turns
 ):
-    """By no more than their own, falling rate lets them; a slide's rotation counts as known."""
+    """By no more than their own, falling rate lets them, nor than three of their deviations; a slide's rotation counts
+    as known."""
     found = {}
 
     def known(splats, views, T, *_):
@@ -212,6 +213,7 @@ def test_well_known_poses_of_parts_against_others_learn_with_merged_gaussians(
     assert (not torch.equal(poses.base[1, 1], found["T"][1, 1])) == shifts
     assert (not torch.allclose(change[:3, :3], torch.eye(3).double(), atol=1e-9)) == turns
     assert torch.allclose(change[:3, :3], torch.eye(3).double(), atol=0.003)
+    assert so3_log(change[:3, :3]).norm() < 1.01 * MOST * 0.1 * deviation
     assert not poses.rotation.any() and not poses.translation.any()
     assert trainer.optimizers.optimizers["part_poses"].param_groups[0]["lr"] < 0.1 * RATES[0]
 
