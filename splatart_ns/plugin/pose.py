@@ -7,6 +7,7 @@ import random
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,7 +30,7 @@ from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.plugin.semantic_run import find_semantic_runs, read_state
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.flush import is_flush
+from splatart_ns.stages.flush import border_against_others
 from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.neighbours import turned_as_neighbours_let
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
@@ -45,13 +46,18 @@ from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_vie
 THINNING_STEPS = 25
 """A round of thinning comes after every so many-th part of the steps on merged Gaussians."""
 BESIDE = 0.5
-"""Poses of parts with more than this share of their border against others learn along with merged Gaussians."""
+"""Poses of parts with more than this share of their border against others in one state learn along with merged
+Gaussians,"""
+SET_FREE = 0.1
+"""if the other state shows less of it there by this: of doors and drawers 0.12 to 0.33, of robots' links up to 0.08."""
 RATES = 1e-3, 2e-5
 """Of these poses, in the first and in the last step; radians and radii of the part."""
 MOST = 3.0
 """So many standard deviations at most these poses move: light counts in that loss, and leads them astray."""
 WELL_KNOWN = 0.01
 """Their largest standard deviation, in radians and radii: others would be led by single views."""
+FEW = 4
+"""Of more turns that look alike a note says how many there are, and within which bounds."""
 
 
 @dataclass
@@ -238,9 +244,11 @@ class PosePipeline(VanillaPipeline):
     def _note_alike(self, p: int, s: int, motion: InitialMotion) -> None:
         """Say by which other turns the images show a part as well."""
         if motion.alike:
-            turn, *others = (f"{math.degrees(so3_log(T[:3, :3]).norm()):.0f}" for T in (motion.T, *motion.alike))
+            turn, *others = (round(math.degrees(so3_log(T[:3, :3]).norm())) for T in (motion.T, *motion.alike))
+            few = " or ".join(str(other) for other in others)
+            by = few if len(others) <= FEW else f"{len(others)} others of {min(others)} to {max(others)}"
             part = f"part {self.model.part_names[p + 1]}, state {s}"
-            self.notes.append(f"{part}: turned by {turn} degrees; by {' or '.join(others)} it looks nearly the same.")
+            self.notes.append(f"{part}: turned by {turn} degrees; by {by} it looks nearly the same.")
             CONSOLE.log(self.notes[-1], markup=False)
 
     def _note_resting(self, held: Tensor, T: Tensor, covariance: Tensor) -> None:
@@ -423,16 +431,19 @@ class PosePipeline(VanillaPipeline):
     def _learning_along(self, splats: list[Splat]) -> Tensor:
         """Which poses [S, P] learn along with the merged Gaussians.
 
-        Where a part lies against others, as a door does, its edges and what they touch are haze that no view shows;
-        moved, it shows, and shifts the part. Merged Gaussians lose it, for all states say what is there. Links of
-        robots, free all around, came out worse, so their poses stay as they were found.
+        Where a part lies against others, as a shut door does, its edges and what they touch are haze that no view
+        shows; set free, it shows, and shifts the part. Merged Gaussians lose it, for all states say what is there.
+        Links of robots lie against as much in all states, or are free all around; they came out worse, so their poses
+        stay as they were found.
         """
         model, T = self.model, self.model.poses.base
+        border = cache(lambda p, s: border_against_others(self.views[s], p + 1))
         centroids, radii = part_extents(splats[0], model.num_parts)
         learning = torch.zeros_like(self._known)
         for s, p in (self._known & self._known[0] & ~self._frozen).nonzero().tolist():
             if s > 0 and is_sure(T[s, p], model.covariance[s, p], centroids[p], radii[p], WELL_KNOWN):
-                learning[s, p] = any(is_flush(self.views[t], p + 1, BESIDE) for t in (self._reference[p], s))
+                less, more = sorted(border(p, t) for t in (self._reference[p], s))
+                learning[s, p] = more > BESIDE and more - less > SET_FREE
         return learning
 
     @torch.no_grad()

@@ -40,8 +40,13 @@ LEAST = 0.1
 """Where less than this share of a part's pixels is left in both states together, all of them count."""
 
 
-def is_flush(views: Sequence[View], part: int, share: float = FLUSH) -> bool:
-    """Whether more than a share of a part's border lies against other parts."""
+def is_flush(views: Sequence[View], part: int) -> bool:
+    """Whether more than `FLUSH` of a part's border lies against other parts."""
+    return border_against_others(views, part) > FLUSH
+
+
+def border_against_others(views: Sequence[View], part: int) -> float:
+    """The share of a part's border, in labelled views, that lies against other parts; 0 where none shows it."""
     against = torch.zeros(2)
     for view in best_views(views, part, MAX_VIEWS):
         if view.labels is None:
@@ -50,7 +55,7 @@ def is_flush(views: Sequence[View], part: int, share: float = FLUSH) -> bool:
             for inside, beside in ((labels[1:], labels[:-1]), (labels[:-1], labels[1:])):
                 beside = beside[(inside == part) & (beside != part) & (beside != UNLABELLED)]
                 against += torch.stack([(beside == 0).sum(), (beside > 0).sum()]).cpu()
-    return bool(against[1] > share * against.sum())
+    return float(against[1] / against.sum().clamp_min(1))
 
 
 def surface_depths(splat: Splat, views: Sequence[View]) -> list[Tensor]:

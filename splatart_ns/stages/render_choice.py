@@ -226,8 +226,8 @@ def alike_in_even_light(
     T: Tensor,
     candidates: Tensor,
 ) -> list[Tensor]:
-    """Motions [4, 4] near `candidates` [C, 4, 4] that in even light render a part nearly as well as T [4, 4] does, the
-    best first.
+    """Motions [4, 4] near `candidates` [C, 4, 4] that in even light render a part nearly as well as T [4, 4] does, or
+    as each state's own Gaussians do, the best first.
 
     In even light nothing is told by how what turned is lit, nor by how what is turned over would be.
     """
@@ -241,7 +241,7 @@ def alike_in_even_light(
     near = [refine(even, start, 5) for start in choose(coarse, candidates, float("inf"))]
     least = min(end.cost for end in near)
     ends = [refine(evenly, end.T, 10) for end in near if end.cost <= SIMILAR_TURN * least]
-    limit = ALIKE * refine(evenly, T, 10).cost
+    limit = max(ALIKE * refine(evenly, T, 10).cost, STILL_RATIO * evenly.own_cost())
     return [end.T for end in sorted(ends, key=lambda end: end.cost) if end.cost < limit]
 
 

@@ -181,17 +181,19 @@ def test_merged_gaussians_that_the_images_hardly_miss_go_and_the_report_tells(po
 
 
 @pytest.mark.parametrize(
-    ("beside", "deviation", "turning", "frozen", "shifts", "turns"),
+    ("borders", "deviation", "turning", "frozen", "shifts", "turns"),
     [
-        (True, 0.001, True, False, True, True),
-        (True, 0.001, False, False, True, False),
-        (True, 0.001, True, True, False, False),
-        (True, 0.1, True, False, False, False),
-        (False, 0.001, True, False, False, False),
+        ((0.8, 0.4), 0.001, True, False, True, True),
+        ((0.4, 0.8), 0.001, True, False, True, True),
+        ((0.8, 0.4), 0.001, False, False, True, False),
+        ((0.8, 0.4), 0.001, True, True, False, False),
+        ((0.8, 0.4), 0.1, True, False, False, False),
+        ((0.8, 0.75), 0.001, True, False, False, False),  # as a link of a robot
+        ((0.4, 0.1), 0.001, True, False, False, False),
     ],
 )
-def test_well_known_poses_of_parts_against_others_learn_with_merged_gaussians(
-    pose_trainer, monkeypatch, beside, deviation, turning, frozen, shifts, turns
+def test_well_known_poses_of_parts_set_free_from_others_learn_with_merged_gaussians(
+    pose_trainer, monkeypatch, borders, deviation, turning, frozen, shifts, turns
 ):
     """By no more than their own, falling rate lets them, nor than three of their deviations; a slide's rotation counts
     as known."""
@@ -203,8 +205,12 @@ def test_well_known_poses_of_parts_against_others_learn_with_merged_gaussians(
         return T, variances.diag().repeat(*T.shape[:2], 1, 1), torch.full((2, 2), torch.nan)
 
     monkeypatch.setattr("splatart_ns.plugin.pose.refine_known_poses", known)
-    monkeypatch.setattr("splatart_ns.plugin.pose.is_flush", lambda views, part, share: beside and part == 2)
     trainer = pose_trainer(steps=6, pose_steps=0, init="centroids")
+    shut = trainer.pipeline.views[0]
+    monkeypatch.setattr(
+        "splatart_ns.plugin.pose.border_against_others",
+        lambda views, part: borders[0 if views is shut else 1] if part == 2 else 0.0,
+    )
     trainer.pipeline._frozen[1, 1] = frozen
     trainer.train()
     poses = trainer.pipeline.model.poses

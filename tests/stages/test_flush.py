@@ -12,6 +12,7 @@ from splatart_ns.stages import pose_evidence
 from splatart_ns.stages.flush import (
     REACH,
     TRACE,
+    border_against_others,
     compared_by_seen,
     in_sight,
     is_flush,
@@ -64,6 +65,15 @@ def test_pixels_without_a_label_are_no_border(cupboard):
     unlabelled = [replace(v, labels=torch.where(v.labels == 1, UNLABELLED, v.labels)) for v in shut]
     assert not is_flush(unlabelled, 2)
     assert not is_flush([replace(v, labels=None) for v in shut], 2)
+
+
+def test_border_against_others_counts_pixel_edges_in_all_labelled_views(cupboard):
+    _, (view, *_) = cupboard[1]
+    labels = torch.zeros_like(view.labels)
+    labels[4:8, 4:8], labels[4:8, 8:12] = 1, 2  # a square of 16 edges, 4 of them against another
+    seen = replace(view, labels=labels, alpha=(labels > 0).to(view.alpha))
+    assert border_against_others([seen, replace(seen, labels=None)], 1) == pytest.approx(4 / 16)
+    assert border_against_others([replace(seen, labels=None)], 1) == 0
 
 
 @pytest.fixture(scope="module")
