@@ -32,7 +32,11 @@ _MAX_ITERATIONS = 50
 
 
 def refine_tree(
-    tree: KinematicTree, points: Mapping[int, Tensor], motions: Mapping[int, Tensor], errors: Mapping[int, Tensor]
+    tree: KinematicTree,
+    points: Mapping[int, Tensor],
+    motions: Mapping[int, Tensor],
+    errors: Mapping[int, Tensor],
+    weighed_by: Mapping[int, Tensor] | None = None,
 ) -> KinematicTree:
     """The tree with the parameters, values, residuals and covariances of its joints refined together.
 
@@ -42,9 +46,10 @@ def refine_tree(
         motions: Observed motions [S, 4, 4] by part, canonical frame.
         errors: Their covariances [S, 6, 6], T_true = exp(d) T, d = (translation, rotation) about the world's origin.
             Those of a root that did not stand still count for every part.
+        weighed_by: The covariances by which the motions are weighed against each other, where not by `errors`.
     """
     motions = {p: T.double() for p, T in motions.items()}
-    chains = _Chains.of(tree, points, motions, errors)
+    chains = _Chains.of(tree, points, motions, errors, weighed_by or errors)
     joints = chains.start
     if not joints:
         return tree
@@ -66,9 +71,11 @@ def refine_tree(
             damping *= 10
             if damping > 1e6:  # only rounding is left
                 break
+    C, H_inv = torch.block_diag(*chains.spread.values()), inverse_hessian(J)
     freedom = J.shape[0] - J.shape[1]
-    inflation = max(1.0, cost / freedom) if freedom > 0 else 1.0
-    return replace(tree, joints=chains.finished(joints, points, motions, inflation * inverse_hessian(J)))
+    inflation = max(1.0, float(r @ torch.linalg.solve(C, r)) / freedom) if freedom > 0 else 1.0
+    covariance = inflation * (H_inv @ (J.T @ C @ J) @ H_inv)
+    return replace(tree, joints=chains.finished(joints, points, motions, covariance))
 
 
 @dataclass(frozen=True)
@@ -84,11 +91,17 @@ class _Chains:
     observed: dict[int, Tensor]
     """Motions [n, 4, 4] of the parts that joints move."""
     whiten: dict[int, Tensor]
-    """What makes their errors standard normal [n, 6, 6]."""
+    """What would make their errors standard normal [6 n, 6 n], were they as they are weighed,"""
+    spread: dict[int, Tensor]
+    """and their covariances once it did."""
 
     @staticmethod
     def of(
-        tree: KinematicTree, points: Mapping[int, Tensor], motions: Mapping[int, Tensor], errors: Mapping[int, Tensor]
+        tree: KinematicTree,
+        points: Mapping[int, Tensor],
+        motions: Mapping[int, Tensor],
+        errors: Mapping[int, Tensor],
+        weighed_by: Mapping[int, Tensor],
     ) -> _Chains:
         free = [j.child for j in tree.joints if j.fit.type == "free"]
         jointed = [j for j in tree.joints if j.child not in free]
@@ -100,10 +113,16 @@ class _Chains:
                 start[j.child] = j.fit.axis[None], (j.fit.origin - c)[None], torch.tensor([j.fit.pitch]).to(c), values
                 centroid[j.child] = from_rotation_translation(torch.eye(3).to(c), c)
         root_moved = bool((motions[tree.root] != torch.eye(4).to(motions[tree.root])).any())
-        whiten = {}
+        whiten, spread = {}, {}
         for j in jointed:
-            C = errors[j.child] + errors[tree.root] if root_moved else errors[j.child]
-            whiten[j.child] = torch.linalg.inv(torch.linalg.cholesky(C[1:].double()))
+            weights, together = (
+                _with_common_share(
+                    (C[j.child] + C[tree.root] if root_moved else C[j.child])[1:].double(), motions[j.child][1:]
+                )
+                for C in (weighed_by, errors)
+            )
+            W = whiten[j.child] = torch.linalg.inv(torch.linalg.cholesky(weights))
+            spread[j.child] = W @ together @ W.T
         return _Chains(
             tree=tree,
             start=start,
@@ -111,6 +130,7 @@ class _Chains:
             bases={p: motions[p][1:] for p in (tree.root, *free)},
             observed={j.child: motions[j.child][1:] for j in jointed},
             whiten=whiten,
+            spread=spread,
         )
 
     def motions(self, joints: Mapping[int, Joints]) -> dict[int, Tensor]:
@@ -127,9 +147,7 @@ class _Chains:
     def residuals(self, joints: Mapping[int, Joints]) -> Tensor:
         """Errors of the parts' motions in standard deviations [R]."""
         T = self.motions(joints)
-        return torch.cat(
-            [(self.whiten[p] @ _error(T[p], seen)[..., None]).flatten() for p, seen in self.observed.items()]
-        )
+        return torch.cat([self.whiten[p] @ _error(T[p], seen).flatten() for p, seen in self.observed.items()])
 
     def linearised(self, joints: Mapping[int, Joints]) -> tuple[Tensor, Tensor]:
         """The residuals [R] and their derivatives by the parameters, joint after joint [R, K]."""
@@ -144,7 +162,7 @@ class _Chains:
         for p, seen in self.observed.items():
             moves = [C if child in path[p] else torch.zeros_like(C) for child, C in columns.items()]
             carried = inverse_left_jacobian(_error(T[p], seen)) @ torch.cat(moves, -1)
-            rows.append((self.whiten[p] @ carried).flatten(0, 1))
+            rows.append(self.whiten[p] @ carried.flatten(0, 1))
         return self.residuals(joints), torch.cat(rows)
 
     def moved(self, joints: Mapping[int, Joints], step: Tensor) -> dict[int, Joints]:
@@ -180,6 +198,19 @@ class _Chains:
                 j = replace(j, fit=free_joint(T_rel, points[j.child]))
             finished.append(j)
         return finished
+
+
+def _with_common_share(C: Tensor, T: Tensor) -> Tensor:
+    """The covariance [6 n, 6 n] of the errors of a part's motions T [n, 4, 4] together, from their own C [n, 6, 6].
+
+    Each motion compares another state with state 0, and errs as much by how this one shows the part: half of what is
+    uncertain is the same in all of them, seen from the part. With two states nothing is added.
+    """
+    Ad = adjoint(T)
+    precision = Ad.mT @ torch.linalg.inv(C) @ Ad  # in the part's frame at state 0
+    common = torch.linalg.inv(precision.mean(0)) / 2
+    Ad = Ad.flatten(0, 1)
+    return torch.block_diag(*(C / 2)) + Ad @ common @ Ad.mT
 
 
 def _error(T: Tensor, observed: Tensor) -> Tensor:

@@ -163,7 +163,7 @@ def test_a_hinge_elsewhere_than_its_parents_hangs_on_it():
     assert edges(infer_tree(points, motions_of(truth, q))) == {(1, 2), (2, 3)}
 
 
-def test_points_count_for_less_beside_images_with_more_states_and_for_all_without_images(monkeypatch):
+def test_points_count_for_little_beside_images_least_where_motions_are_weighed_and_for_all_without_images(monkeypatch):
     noises = []
 
     def watched(points, T, noise, radius):
@@ -171,12 +171,12 @@ def test_points_count_for_less_beside_images_with_more_states_and_for_all_withou
         return surface_error(points, T, noise, radius)
 
     monkeypatch.setattr("splatart_ns.stages.tree.surface_error", watched)
-    for states, share in ((2, 0.3), (4, 0.1), (None, 1.0)):
-        points, truth, q = drawers(states or 4)
+    for images, shares in ((True, [0.3, 0.02]), (False, [1.0, 1.0])):
+        points, truth, q = drawers(4)
         tiny = 1e-10 * torch.eye(6, dtype=torch.float64).repeat(len(q), 1, 1)
         noises.clear()
-        infer_tree(points, motions_of(truth, q), covariances={p: tiny for p in points} if states else None)
-        assert noises == pytest.approx([share * NOISE] * 3)
+        infer_tree(points, motions_of(truth, q), covariances={p: tiny for p in points} if images else None)
+        assert noises == pytest.approx([share * NOISE for share in shares] * 3)
 
 
 def test_more_states_reject_more_false_pairs():

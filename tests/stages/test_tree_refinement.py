@@ -4,7 +4,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from splatart_ns.geometry.se3 import inverse, se3_exp
+from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp
+from splatart_ns.stages import tree_refinement
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.joint import fit_joint
 from splatart_ns.stages.joint_fit import JointFit, free_joint
@@ -30,19 +31,27 @@ def chain() -> KinematicTree:
     return KinematicTree([1, 2, 3, 4], 1, joints)
 
 
-def observe(sigmas: dict[int, torch.Tensor], seed: int):
-    """Motions of the chain with errors of standard deviations [6] about each part's centroid, and their covariances."""
+def observe(sigmas: dict[int, torch.Tensor], seed: int, share: float = 0.0):
+    """Motions of the chain with errors of standard deviations [6] about each part's centroid, and their covariances.
+
+    A share of the variance is of state 0, which all the motions are counted from.
+    """
     generator = torch.Generator().manual_seed(seed)
     T = dict(zip((1, 2, 3, 4), forward_kinematics(chain(), VALUES.T).unbind(1), strict=True))
     motions, errors = {}, {}
     for p in T:
         sigma = sigmas.get(p, torch.full((6,), 1e-9)).double()
         motions[p], C = T[p].clone(), torch.zeros(4, 6, 6, dtype=torch.float64)
+        at_rest = from_rotation_translation(torch.eye(3).double(), POINTS[p].mean(0))
+        first = (
+            math.sqrt(share) * sigma * torch.randn(6, generator=generator, dtype=torch.float64) if share else 0 * sigma
+        )
         for s in range(1, 4):
             about = torch.eye(4, dtype=torch.float64)
             about[:3, 3] = (T[p][s, :3, :3] @ POINTS[p].mean(0)) + T[p][s, :3, 3]
-            noise = sigma * torch.randn(6, generator=generator, dtype=torch.float64)
-            motions[p][s] = about @ se3_exp(noise) @ inverse(about) @ T[p][s]
+            noise = math.sqrt(1 - share) * sigma * torch.randn(6, generator=generator, dtype=torch.float64)
+            since_first = T[p][s] @ at_rest @ se3_exp(first) @ inverse(at_rest)
+            motions[p][s] = about @ se3_exp(noise) @ inverse(about) @ since_first
             A = torch.eye(6, dtype=torch.float64)
             x, y, z = about[:3, 3]
             A[:3, 3:] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -93,18 +102,38 @@ def test_what_one_link_hides_its_neighbours_tell():
     assert sum(whole) < 0.2 * sum(pairwise)
 
 
-def test_covariances_tell_how_far_off_axes_are():
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_covariances_tell_how_far_off_axes_are(share):
     """Over many draws the squared error over its variance has the mean of a chi^2 of 2 degrees of freedom."""
     sigma = torch.tensor([1e-3, 1e-3, 1e-3, 4e-3, 4e-3, 4e-3])
     ratios = []
     for seed in range(40):
-        motions, errors = observe({2: sigma, 3: sigma, 4: sigma}, seed)
+        motions, errors = observe({2: sigma, 3: sigma, 4: sigma}, seed, share)
         refined = refine_tree(fitted_pairwise(motions), POINTS, motions, errors)
         for k, j in enumerate(refined.joints):
             error = torch.sign(j.fit.axis @ AXES[k]) * j.fit.axis - AXES[k]
             C = torch.tensor(j.fit.covariance["axis"], dtype=torch.float64)
             ratios.append(float(error @ torch.linalg.pinv(C, rtol=1e-6) @ error))
     assert 1.4 < sum(ratios) / len(ratios) < 2.6
+
+
+def test_errors_of_state_0_are_told_from_those_of_the_others(monkeypatch):
+    sigma = torch.full((6,), 2e-3)
+    together, apart = [], []
+    for seed in range(40):
+        motions, errors = observe({2: sigma, 3: sigma, 4: sigma}, seed, share=0.5)
+        tree = fitted_pairwise(motions)
+        together += axis_errors(refine_tree(tree, POINTS, motions, errors))
+        with monkeypatch.context() as patched:
+            patched.setattr(tree_refinement, "_with_common_share", lambda C, T: torch.block_diag(*C))
+            apart += axis_errors(refine_tree(tree, POINTS, motions, errors))
+    assert sum(together) < 0.95 * sum(apart)
+
+
+def test_a_single_motion_has_the_errors_it_is_said_to_have():
+    motions, errors = observe({3: torch.tensor([1e-3, 2e-3, 1e-3, 4e-3, 5e-3, 4e-3])}, 0)
+    C = errors[3][1:2].double()
+    assert torch.allclose(tree_refinement._with_common_share(C, motions[3][1:2]), C[0], rtol=1e-6, atol=1e-12)
 
 
 def test_fixed_and_free_joints_stay_and_carry_what_hangs_on_them():
