@@ -39,9 +39,6 @@ _SEEN_NOISE = 0.3
 """Share of the noise that is left where the covariances of the motions are known. Measured on random objects: with 0.03
 only 89 % of the true lines lie in their 95 % regions; with all of it, a thin part that turned by 21 degrees about its
 own length counted as fixed."""
-_WEIGHED_NOISE = 0.02
-"""Share of it by which motions of known covariances are weighed against each other: axes of robots and cupboards came
-out nearer than with more. Regions would be too small with so little."""
 _STACKED = 0.02
 """Cost of a joint that does not hang on the root: two drawers that touch each other and the body alike slide in the
 body both."""
@@ -146,9 +143,11 @@ def infer_tree(
         if covariances is not None:
             unknown = (10 * radius) ** 2 * torch.eye(6).to(told)
             told = torch.where(known[p][:, None, None], covariances[p].to(told), unknown)
+        # Regions need the points' noise, but beside what the images say it counts for less in the weights the more
+        # motions there are: measured.
+        share = 1 if covariances is None else max(1, len(motions[p]) - 1) ** 2
         errors[p], weights[p] = (
-            told + surface_error(x.double(), motions[p].double(), least, radius)
-            for least in (floor, noise if covariances is None else _WEIGHED_NOISE * noise)
+            told + surface_error(x.double(), motions[p].double(), least, radius) for least in (floor, floor / share)
         )
     tree = refine_tree(tree, points, motions, errors, weights)
     return tree if covariances is None else turned_unseen(tree, points, motions, covariances, errors, constraints)

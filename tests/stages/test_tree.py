@@ -163,7 +163,7 @@ def test_a_hinge_elsewhere_than_its_parents_hangs_on_it():
     assert edges(infer_tree(points, motions_of(truth, q))) == {(1, 2), (2, 3)}
 
 
-def test_points_count_for_little_beside_images_least_where_motions_are_weighed_and_for_all_without_images(monkeypatch):
+def test_points_count_for_less_beside_images_least_where_many_motions_are_weighed(monkeypatch):
     noises = []
 
     def watched(points, T, noise, radius):
@@ -171,8 +171,8 @@ def test_points_count_for_little_beside_images_least_where_motions_are_weighed_a
         return surface_error(points, T, noise, radius)
 
     monkeypatch.setattr("splatart_ns.stages.tree.surface_error", watched)
-    for images, shares in ((True, [0.3, 0.02]), (False, [1.0, 1.0])):
-        points, truth, q = drawers(4)
+    for states, images, shares in ((2, True, [0.3, 0.3]), (4, True, [0.3, 0.3 / 9]), (4, False, [1.0, 1.0])):
+        points, truth, q = drawers(states)
         tiny = 1e-10 * torch.eye(6, dtype=torch.float64).repeat(len(q), 1, 1)
         noises.clear()
         infer_tree(points, motions_of(truth, q), covariances={p: tiny for p in points} if images else None)
