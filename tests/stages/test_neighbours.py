@@ -4,6 +4,7 @@ from part_scene import angle_deg, box, motion, photograph, two_states
 
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.neighbours import turned_as_neighbours_let
+from splatart_ns.stages.part_pair import PartPair
 from splatart_ns.stages.render_choice import InitialMotion
 
 EYE = torch.eye(4, dtype=torch.float64)
@@ -53,6 +54,19 @@ def test_a_part_that_looks_otherwise_is_left_turned_over():
     T = motion((0, 0, 120), (0.1, 0.0, 0.0))  # so it did turn: its faces and their halves are of other colours
     found = turned_as_neighbours_let(*two_states(T), {1: RESTS, 2: InitialMotion(T, found=True)})
     assert torch.equal(found[2].T, T) and found[2].alike == ()
+
+
+@pytest.mark.parametrize("own_cost", [0.0, 1.0])
+def test_a_motion_that_fits_no_worse_than_the_states_own_gaussians_counts_as_alike(monkeypatch, own_cost):
+    """By how a flange, half of it hidden, fits better turned over, it fits better than its own Gaussians do."""
+    T = about(motion((0, 0, 25), (0, 0, 0)), CENTRE)
+    base, coloured = (box(part, size, centre, 0.04) for part, size, centre in (BASE, KNOB))
+    splats = Splat.cat([base, coloured]), Splat.cat([base, coloured.transformed(over(T))])
+    monkeypatch.setattr(PartPair, "own_cost", lambda pair: own_cost)
+    motions = {1: RESTS, 2: InitialMotion(over(T), found=True)}
+    found = turned_as_neighbours_let(splats, tuple(photograph(s) for s in splats), motions)[2]
+    assert (angle_deg(found.T, T) < 45) == (own_cost > 0)  # as it refines on colours that do not fit
+    assert len(found.alike) == (own_cost > 0)
 
 
 def test_a_door_opens_about_its_hinge_where_it_looks_alike_turned_about_its_middle():
