@@ -245,7 +245,8 @@ class PosePipeline(VanillaPipeline):
         """Say by which other turns the images show a part as well."""
         if motion.alike:
             turn, *others = (round(math.degrees(so3_log(T[:3, :3]).norm())) for T in (motion.T, *motion.alike))
-            few = " or ".join(str(other) for other in others)
+            others = list(dict.fromkeys(others))
+            few = " or ".join(map(str, others))
             by = few if len(others) <= FEW else f"{len(others)} others of {min(others)} to {max(others)}"
             part = f"part {self.model.part_names[p + 1]}, state {s}"
             self.notes.append(f"{part}: turned by {turn} degrees; by {by} it looks nearly the same.")

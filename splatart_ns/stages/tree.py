@@ -144,7 +144,7 @@ def infer_tree(
             unknown = (10 * radius) ** 2 * torch.eye(6).to(told)
             told = torch.where(known[p][:, None, None], covariances[p].to(told), unknown)
         # Regions need the points' noise, but beside what the images say it counts for less in the weights the more
-        # motions there are: measured.
+        # motions there are: measured, see docs/accuracy.md.
         share = 1 if covariances is None else max(1, len(motions[p]) - 1) ** 2
         errors[p], weights[p] = (
             told + surface_error(x.double(), motions[p].double(), least, radius) for least in (floor, floor / share)

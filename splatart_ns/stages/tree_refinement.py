@@ -71,10 +71,15 @@ def refine_tree(
             damping *= 10
             if damping > 1e6:  # only rounding is left
                 break
-    C, H_inv = torch.block_diag(*chains.spread.values()), inverse_hessian(J)
-    freedom = J.shape[0] - J.shape[1]
-    inflation = max(1.0, float(r @ torch.linalg.solve(C, r)) / freedom) if freedom > 0 else 1.0
-    covariance = inflation * (H_inv @ (J.T @ C @ J) @ H_inv)
+    # What the residuals cost, and how the solution spreads, by the errors that the motions have.
+    spread, due = torch.zeros_like(J.T @ J), 0.0
+    sizes = [len(C) for C in chains.spread.values()]
+    for C, r_part, J_part in zip(chains.spread.values(), r.split(sizes), J.split(sizes), strict=True):
+        spread += J_part.T @ C @ J_part
+        due += float(r_part @ torch.linalg.solve(C, r_part))
+    freedom, H_inv = J.shape[0] - J.shape[1], inverse_hessian(J)
+    inflation = max(1.0, due / freedom) if freedom > 0 else 1.0
+    covariance = inflation * (H_inv @ spread @ H_inv)
     return replace(tree, joints=chains.finished(joints, points, motions, covariance))
 
 

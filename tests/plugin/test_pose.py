@@ -1,5 +1,6 @@
 import copy
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -242,6 +243,21 @@ def test_a_part_is_not_shown_in_a_state_where_its_pose_is_not_known(pose_trainer
     assert shown == [{1}, {1, 2}]
     pipeline._note_unknown(known)
     assert len(pipeline.notes) == 1 and pipeline.notes[0].startswith("part lid, state 0: ")
+
+
+@pytest.mark.parametrize(
+    ("turns", "by"),
+    [
+        ((30, 150), "by 150 it"),
+        ((30, 150, 90, 150), "by 150 or 90 it"),
+        ((30, 90, 100, 110, 120, 80), "by 5 others of 80 to 120 it"),
+    ],
+)
+def test_turns_that_look_alike_are_noted_all_if_they_are_few(pose_trainer, turns, by):
+    pipeline = pose_trainer(init="centroids").pipeline
+    T, *alike = (se3_exp(torch.tensor([0, 0, 0, 0, 0, math.radians(turn)]).double()) for turn in turns)
+    pipeline._note_alike(1, 1, InitialMotion(T, found=True, alike=tuple(alike)))
+    assert pipeline.notes == [f"part lid, state 1: turned by 30 degrees; {by} looks nearly the same."]
 
 
 def test_a_part_that_may_have_turned_unseen_is_noted(pose_trainer):
