@@ -163,20 +163,27 @@ def test_a_hinge_elsewhere_than_its_parents_hangs_on_it():
     assert edges(infer_tree(points, motions_of(truth, q))) == {(1, 2), (2, 3)}
 
 
-def test_points_count_for_less_beside_images_least_where_many_motions_are_weighed(monkeypatch):
-    noises = []
+@pytest.mark.parametrize(
+    ("states", "images", "of_errors", "of_weights"),
+    [(2, True, 0.3, 0.3), (4, True, 0.3, 0.3 / 9), (4, False, 1.0, 1.0)],
+)
+def test_points_count_for_less_beside_images_least_where_many_motions_are_weighed(
+    monkeypatch, states, images, of_errors, of_weights
+):
+    told = {}
 
-    def watched(points, T, noise, radius):
-        noises.append(noise)
-        return surface_error(points, T, noise, radius)
+    def watched(tree, points, motions, errors, weighed_by):
+        told.update(errors=errors, weighed_by=weighed_by)
+        return tree
 
-    monkeypatch.setattr("splatart_ns.stages.tree.surface_error", watched)
-    for states, images, shares in ((2, True, [0.3, 0.3]), (4, True, [0.3, 0.3 / 9]), (4, False, [1.0, 1.0])):
-        points, truth, q = drawers(states)
-        tiny = 1e-10 * torch.eye(6, dtype=torch.float64).repeat(len(q), 1, 1)
-        noises.clear()
-        infer_tree(points, motions_of(truth, q), covariances={p: tiny for p in points} if images else None)
-        assert noises == pytest.approx([share * NOISE for share in shares] * 3)
+    monkeypatch.setattr("splatart_ns.stages.tree.refine_tree", watched)
+    points, truth, q = drawers(states)
+    motions = motions_of(truth, q)
+    seen = 1e-10 * torch.eye(6, dtype=torch.float64).repeat(states, 1, 1)
+    infer_tree(points, motions, covariances={p: seen for p in points} if images else None)
+    for name, share in (("errors", of_errors), ("weighed_by", of_weights)):
+        noise = surface_error(points[2].double(), motions[2].double(), share * NOISE, object_radius(points))
+        torch.testing.assert_close(told[name][2], noise + seen if images else noise)
 
 
 def test_more_states_reject_more_false_pairs():

@@ -43,9 +43,7 @@ def observe(sigmas: dict[int, torch.Tensor], seed: int, share: float = 0.0):
         sigma = sigmas.get(p, torch.full((6,), 1e-9)).double()
         motions[p], C = T[p].clone(), torch.zeros(4, 6, 6, dtype=torch.float64)
         at_rest = from_rotation_translation(torch.eye(3).double(), POINTS[p].mean(0))
-        first = (
-            math.sqrt(share) * sigma * torch.randn(6, generator=generator, dtype=torch.float64) if share else 0 * sigma
-        )
+        first = math.sqrt(share) * sigma * torch.randn(6, generator=generator, dtype=torch.float64)
         for s in range(1, 4):
             about = torch.eye(4, dtype=torch.float64)
             about[:3, 3] = (T[p][s, :3, :3] @ POINTS[p].mean(0)) + T[p][s, :3, 3]
@@ -128,6 +126,19 @@ def test_errors_of_state_0_are_told_from_those_of_the_others(monkeypatch):
             patched.setattr(tree_refinement, "_with_common_share", lambda C, T: torch.block_diag(*C))
             apart += axis_errors(refine_tree(tree, POINTS, motions, errors))
     assert sum(together) < 0.95 * sum(apart)
+
+
+def test_covariances_are_of_the_errors_and_not_of_the_weights():
+    """All weights alike times as large change nothing."""
+    sigma = torch.tensor([1e-3, 1e-3, 1e-3, 4e-3, 4e-3, 4e-3])
+    motions, errors = observe({2: sigma, 3: sigma, 4: sigma}, 0)
+    tree = fitted_pairwise(motions)
+    expected = refine_tree(tree, POINTS, motions, errors).joints
+    found = refine_tree(tree, POINTS, motions, errors, {p: C / 100 for p, C in errors.items()}).joints
+    for a, b in zip(found, expected, strict=True):
+        assert torch.allclose(a.fit.axis, b.fit.axis, atol=1e-6)
+        for name, C in b.fit.covariance.items():
+            torch.testing.assert_close(torch.tensor(a.fit.covariance[name]), torch.tensor(C), rtol=1e-3, atol=1e-12)
 
 
 def test_a_single_motion_has_the_errors_it_is_said_to_have():
