@@ -47,8 +47,8 @@ THINNING_STEPS = 25
 """A round of thinning comes after every so many-th part of the steps on merged Gaussians."""
 BESIDE, SET_FREE = 0.5, 0.1
 """Poses of parts learn along with merged Gaussians if one state shows more than the first share of their border against
-others, and the other less of it by the second. 16 doors and drawers had 0.12 to 0.38 less, 80 of 93 links of robots less
-than 0.1; the others are fingers and wrists that fold."""
+others, and the other less of it by the second. 16 doors and drawers had 0.12 to 0.38 less, 80 of 93 links of robots
+less than 0.1; the others are fingers and wrists that fold."""
 RATES = 1e-3, 2e-5
 """Of these poses, in the first and in the last step; radians and radii of the part."""
 MOST = 3.0
