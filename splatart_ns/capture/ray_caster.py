@@ -197,8 +197,9 @@ def _halved(image: np.ndarray) -> np.ndarray:
 
 def _doubled_area(triangles: np.ndarray) -> np.ndarray:
     a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    cross = np.cross(a, b)
-    return np.abs(cross) if cross.ndim == 1 else np.linalg.norm(cross, axis=-1)
+    if triangles.shape[-1] == 2:
+        return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    return np.linalg.norm(np.cross(a, b), axis=-1)
 
 
 def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from splatart_ns.machine import CALM_THREADS, num_cores, num_gpus
+from splatart_ns.machine import CALM_THREADS, num_cores
 
 os.environ.update({**CALM_THREADS, **os.environ})  # of both ends
 
@@ -91,7 +91,7 @@ class Companions:
 
     def start_early(self) -> None:
         """One, where states will be trained side by side: a capture has at least two."""
-        if num_cores() > 1 and num_gpus() == 0:
+        if num_cores() > 1:
             self.first(1)
 
     def first(self, count: int) -> list[Companion]:

@@ -64,9 +64,14 @@ def _saving(folder: Path) -> Iterator[None]:
         raise InputError(f"{folder}: cannot be written ({why}); check the space on the disk.") from error
 
 
+ON_ONE_GPU = 2
+"""Runs that train on a GPU side by side: to start its kernels takes a core longer than they take."""
+
+
 def num_processes(runs: int) -> int:
     """How many runs to train side by side: one thread a run is faster than many threads a run, one after the other."""
-    return 1 if default_device() == "cuda" else max(1, min(runs, num_cores()))
+    most = ON_ONE_GPU if default_device() == "cuda" else runs
+    return max(1, min(runs, num_cores(), most))
 
 
 def run_side_by_side(

@@ -54,8 +54,9 @@ def render(
         absgrad, rasterize_mode, backend: See `rasterization`.
     """
     degree = splat.sh_degree if sh_degree is None else min(sh_degree, splat.sh_degree)
-    colors = sh_colors(splat.means, splat.sh, viewmats, degree, backend)
+    colors = splat.sh
     if features is not None:
+        colors = sh_colors(splat.means, splat.sh, viewmats, degree, backend)
         colors = torch.cat([colors, features.expand(len(viewmats), -1, -1)], -1)
     image, accumulation, info = rasterization(
         splat.means,
@@ -67,6 +68,7 @@ def render(
         Ks,
         width,
         height,
+        sh_degree=degree if features is None else None,
         render_mode="RGB+ED" if with_depth else "RGB",
         absgrad=absgrad,
         rasterize_mode=rasterize_mode,

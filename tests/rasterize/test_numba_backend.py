@@ -205,6 +205,7 @@ def test_kernels_compile_where_no_cache_can_be_kept():
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.skipif(torch.cuda.is_available(), reason="with CUDA torch refuses gradients in forked processes")
 def test_a_forked_child_renders(num_threads):
     num_threads(2)
     s = scene(N=50)
