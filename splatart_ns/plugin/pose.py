@@ -407,7 +407,6 @@ class PosePipeline(VanillaPipeline):
             self._frozen,
             self._reference,
             self._known,
-            self._cameras_refined,
             self._clear if as_begun else None,
         )
         model.poses.commit(T)

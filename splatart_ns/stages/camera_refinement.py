@@ -81,12 +81,12 @@ def _refined(splat: Splat, seen: PartView, given: Tensor, centroid: Tensor, radi
     def far(motions: Tensor) -> Tensor:
         return se3_log(viewmat @ motions @ inverse(given)) / scale
 
-    steps = trial_steps(6, True, viewmat)
+    steps = trial_steps(6, viewmat)
     motions = increment(eye.expand(len(steps), 4, 4), steps, centroid, radius)
-    H, g, cost = linearized(seen.difference(splat, motions, first_order=True), seen.weight, STEP, central=True)
+    H, g, cost = linearized(seen.difference(splat, motions, first_order=True), seen.weight)
     noise = 2 * cost / float(seen.weight.sum())
-    r, after, before = far(motions).split([1, 6, 6])
-    r, J = r[0], (after - before) / (2 * STEP)
+    r, *after = far(motions)
+    J = (torch.stack(after) - r) / STEP
     step = -torch.linalg.solve(H + noise * J @ precision @ J.T, g + noise * J @ precision @ r)
     most = cost + 0.5 * noise * float(r @ precision @ r)
     for _ in range(3):

@@ -52,7 +52,6 @@ def refine_poses(
     views: Sequence[Sequence[View]],
     T: Tensor,
     frozen: Tensor,
-    central: bool = False,
     clear: Sequence[Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The last rung of the search for poses: Gauss-Newton on all views, and the certainty that they give.
@@ -73,7 +72,6 @@ def refine_poses(
         views: Training views of each state.
         T: Poses [S, P, 4, 4], near the optimum.
         frozen: Which of them stay as they are [S, P] bool.
-        central: See `refine`.
         clear: `clearest` of each state's Gaussians in its own views [N], if it has been measured.
 
     Returns:
@@ -93,26 +91,26 @@ def refine_poses(
                 covariances[s, p] = torch.nan
                 continue
             if frozen[s, p]:
-                stays = refine(pair, T[s, p], 0, central=central)
-                found = _slid_a_little(pair, stays, central) or stays
+                stays = refine(pair, T[s, p], 0)
+                found = _slid_a_little(pair, stays) or stays
                 T[s, p], equations = found.T, found.equations
             else:
-                found = refine(pair, T[s, p], MAX_ITERATIONS, central=central)
+                found = refine(pair, T[s, p], MAX_ITERATIONS)
                 clearer = comparison.without_haze(pair, p + 1, s, found.T)
                 if clearer is not pair:
-                    pair, found = clearer, refine(clearer, found.T, MAX_ITERATIONS, central=central)
+                    pair, found = clearer, refine(clearer, found.T, MAX_ITERATIONS)
                 T[s, p], equations = found.T, found.equations
             turned, untold = settle_turn((splats[0], splats[s]), (views[0], views[s]), p + 1, T[s, p])
             if not torch.equal(turned, T[s, p]):
-                found = refine(pair, turned, MAX_ITERATIONS, central=central)
+                found = refine(pair, turned, MAX_ITERATIONS)
                 if not untold.any():
-                    found, untold = _held_by_brightness(pair, T[s, p], turned, found, central)
+                    found, untold = _held_by_brightness(pair, T[s, p], turned, found)
                 T[s, p], equations = found.T, found.equations
             covariances[s, p] = motion_covariance(pair, T[s, p], equations) + untold
             if something_rests and not frozen[s, p]:
                 refined += 1
                 if not untold.any() and _may_have_slid(pair, T[s, p]):
-                    slide = shifted(pair, T[s, p], central=central)
+                    slide = shifted(pair, T[s, p])
                     if slide.cost < PRISMATIC_BELOW * found.cost:
                         slides[s] = slide.T, motion_covariance(pair, slide.T, slide.equations)
         if len(slides) == refined:
@@ -121,7 +119,7 @@ def refine_poses(
     return T, covariances
 
 
-def _slid_a_little(pair: PartPair, stays: Refinement, central: bool) -> Refinement | None:
+def _slid_a_little(pair: PartPair, stays: Refinement) -> Refinement | None:
     """The slide of a part that seems to stay as it is, if it is one that no error explains.
 
     Buttons move by a pixel or two, which hardly shows in what their images cost, but in all of them alike.
@@ -131,7 +129,7 @@ def _slid_a_little(pair: PartPair, stays: Refinement, central: bool) -> Refineme
     step = -torch.linalg.solve(shift.H.sum(0), shift.g.sum(0)) * pair.radius
     if _deviations(step, motion_covariance(pair, T, shift)) < SLID:
         return None
-    slide = shifted(pair, T, T[:3, :3], central)
+    slide = shifted(pair, T, T[:3, :3])
     moved = transform_points(slide.T, pair.centroid[None])[0] - transform_points(T, pair.centroid[None])[0]
     surely = _deviations(moved, motion_covariance(pair, slide.T, slide.equations)) >= SLID
     return slide if surely and moved.norm() >= LEAST_SLIDE * _pixel(pair) else None
@@ -198,9 +196,7 @@ class _Comparison:
         return pair if self._lies_flush(part, s) else without_haze(pair, T, (self._free(0), self._free(s)))
 
 
-def _held_by_brightness(
-    pair: PartPair, T: Tensor, told: Tensor, ends: Refinement, central: bool
-) -> tuple[Refinement, Tensor]:
+def _held_by_brightness(pair: PartPair, T: Tensor, told: Tensor, ends: Refinement) -> tuple[Refinement, Tensor]:
     """Where a round part's pose T [4, 4] ends that brightness told to be turned to `told`, and how uncertain that is
     [6, 6]; `ends`: where refining put it from there.
 
@@ -209,7 +205,7 @@ def _held_by_brightness(
     """
     if so3_log(ends.T[:3, :3] @ told[:3, :3].mT).norm() < SLIPPED:
         return ends, torch.zeros(6, 6).to(told)
-    bright = refine(replace(pair, even_light=False), told, MAX_ITERATIONS, central=central)
+    bright = refine(replace(pair, even_light=False), told, MAX_ITERATIONS)
     slip = se3_log(ends.T @ inverse(bright.T))
     angle = slip[3:].norm()
     if angle > LOST:

@@ -55,7 +55,6 @@ def refine_known_poses(
     frozen: Tensor,
     reference: Sequence[int],
     known: Tensor,
-    central: bool = False,
     clear: Sequence[Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`refine_poses` and `rotation_held_ratios` of every part against its reference state.
@@ -67,7 +66,7 @@ def refine_known_poses(
         frozen: Which of them stay as they are [S, P] bool.
         reference: Each part's reference state.
         known: Which poses were found [S, P] bool.
-        central, clear: See `refine_poses`.
+        clear: See `refine_poses`.
 
     Returns:
         The refined poses, their covariances [S, P, 6, 6] (NaN where not known), and the ratios [P, P].
@@ -80,7 +79,7 @@ def refine_known_poses(
     for order, parts in _groups(reference, known):
         chosen = _chosen(splats, views, order, parts)
         shares = clear and [clear[s][_of(splats[s], parts)] for s in order]
-        refined, certainty = refine_poses(*chosen, M[order], frozen[order], central, shares)
+        refined, certainty = refine_poses(*chosen, M[order], frozen[order], shares)
         for p in parts:
             M[order, p], covariances[order, p] = refined[:, p], certainty[:, p]
     for p, first in enumerate(reference):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -13,8 +12,12 @@ from torch.nn.functional import pad
 from splatart_ns.geometry.se3 import from_rotation_translation, skew, so3_exp, transform_points
 from splatart_ns.stages.part_pair import HUBER, PartPair, huber
 
-STEP = 4e-3
-"""Forward differences: radians, part radii, and the logarithm of a scale."""
+STEP = 5e-4
+"""Forward differences: radians, part radii, and the logarithm of a scale. They err by half a step times how the
+residuals bend, and these are not small: where every image is rendered (see `rasterize_neighbours`), steps of 4e-3 put
+the axis of a pair of scissors 0.05 degrees elsewhere."""
+CLOSE = 4e-4
+"""Smaller steps of the search, in the same units, end it."""
 
 
 @dataclass(frozen=True)
@@ -48,19 +51,15 @@ def refine(
     max_iterations: int = 6,
     hold_rotation: bool = False,
     with_scale: bool = False,
-    central: bool = False,
 ) -> Refinement:
     """Levenberg-Marquardt from T [4, 4] on all pixels of the pair, robust by Huber weights.
 
-    `hold_rotation` moves only the translation, `with_scale` lets T become a similarity. `central` takes differences to
-    both sides, at nearly twice the renderings: where every image is rendered (see `rasterize_neighbours`), those to one
-    side err by half a step times how the residuals bend, which ends the search too early where the residuals are large,
-    as they are when cameras are not exact.
+    `hold_rotation` moves only the translation, `with_scale` lets T become a similarity.
     """
     T = T.double()
     n = 3 if hold_rotation else 7 if with_scale else 6
     damping, converged = 1e-3, False
-    equations = normal_equations(pair, T, n, central)
+    equations = normal_equations(pair, T, n)
     iteration = 0
     while iteration < max_iterations and not converged:
         iteration += 1
@@ -70,12 +69,12 @@ def refine(
         trial = increment(T, pad(step, (0, max(0, 6 - n))), pair.centroid, pair.radius)
         cost = float(pair.cost(trial[None])[0])
         if cost < equations.cost:
-            converged = bool(step.abs().max() < 0.1 * STEP) or cost > (1 - 1e-4) * equations.cost
+            converged = bool(step.abs().max() < CLOSE) or cost > (1 - 1e-4) * equations.cost
             T, damping = trial, damping * 0.3
-            equations = equations.after(step, cost) if converged else normal_equations(pair, T, n, central)
+            equations = equations.after(step, cost) if converged else normal_equations(pair, T, n)
         else:
             damping = max(damping, 1e-3) * 10
-            converged = damping > 1e2 or bool(step.abs().max() < 0.1 * STEP)
+            converged = damping > 1e2 or bool(step.abs().max() < CLOSE)
     return Refinement(T, equations.cost, converged, iteration, equations)
 
 
@@ -95,40 +94,34 @@ class NormalEquations:
         return NormalEquations(self.H, self.g + self.H @ step, cost)
 
 
-def trial_steps(n: int, central: bool, like: Tensor) -> Tensor:
-    """Small motions [1 + n or 1 + 2n, max(n, 6)] to linearize about: none, one step along each of the first n
-    parameters and, if `central`, one back."""
+def trial_steps(n: int, like: Tensor) -> Tensor:
+    """Small motions [1 + n, max(n, 6)] to linearize about: none, and one step along each of the first n parameters."""
     steps = STEP * torch.eye(n, dtype=like.dtype, device=like.device)
-    steps = torch.cat([torch.zeros_like(steps[:1]), steps, *([-steps] if central else [])])
-    return pad(steps, (0, max(0, 6 - n)))
+    return pad(torch.cat([torch.zeros_like(steps[:1]), steps]), (0, max(0, 6 - n)))
 
 
-def linearized(difference: Tensor, weight: Tensor, step: float, central: bool = False) -> tuple[Tensor, Tensor, float]:
+def linearized(difference: Tensor, weight: Tensor, step: float = STEP) -> tuple[Tensor, Tensor, float]:
     """Gauss-Newton's H [n, n] and g [n] of the Huber cost of one view, float64, and that cost.
 
     Args:
-        difference: What differs [1 + n, H, W, C]: at the point, and after a step along each parameter; if `central`
-            [1 + 2n, H, W, C], also after one back along each.
+        difference: What differs [1 + n, H, W, C]: at the point, and after a step along each parameter.
         weight: Of the pixels [H, W].
         step: Length of the steps, in the parameters' units.
     """
     r = difference[0].reshape(-1)
     after = difference[1:].reshape(len(difference) - 1, -1)
-    n = len(after) // 2
-    J = (after[:n] - after[n:]) / (2 * step) if central else (after - r) / step
+    J = (after - r) / step
     w = weight[..., None].expand(difference.shape[1:]).reshape(-1)
     wJ = J * (w * (HUBER / r.abs().clamp_min(1e-12)).clamp_max(1.0))
     return (wJ @ J.T).double(), (wJ @ r).double(), float((w * huber(r)).sum())
 
 
 @torch.no_grad()
-def normal_equations(pair: PartPair, T: Tensor, n: int, central: bool = False) -> NormalEquations:
+def normal_equations(pair: PartPair, T: Tensor, n: int) -> NormalEquations:
     """Of the first n of translation, rotation and logarithm of a scale, at T [4, 4]; see `increment` and `refine`."""
-    steps = trial_steps(n, central, T)
+    steps = trial_steps(n, T)
     motions = increment(T.expand(len(steps), 4, 4), steps, pair.centroid, pair.radius)
-    H, gradients, costs = zip(
-        *pair.of_views(motions, partial(linearized, step=STEP, central=central), True), strict=True
-    )
+    H, gradients, costs = zip(*pair.of_views(motions, linearized, True), strict=True)
     return NormalEquations(torch.stack(H), torch.stack(gradients), sum(costs) / max(pair.area, 1.0))
 
 
@@ -165,12 +158,12 @@ def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | No
     return A @ local @ A.T
 
 
-def shifted(pair: PartPair, T: Tensor, R: Tensor | None = None, central: bool = False) -> Refinement:
+def shifted(pair: PartPair, T: Tensor, R: Tensor | None = None) -> Refinement:
     """The best motion with the rotation R [3, 3], by default none, from where T [4, 4] puts the part's centroid."""
     R = torch.eye(3).to(T) if R is None else R.to(T)
     moved = transform_points(T, pair.centroid[None])[0]
     start = from_rotation_translation(R, moved - R @ pair.centroid)
-    return refine(pair, start, hold_rotation=True, central=central)
+    return refine(pair, start, hold_rotation=True)
 
 
 def rotation_held_ratio(pair: PartPair, T: Tensor, R: Tensor) -> float:

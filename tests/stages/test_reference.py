@@ -97,7 +97,7 @@ def test_how_clearly_gaussians_are_seen_is_measured_where_it_is_not_given(scene,
     frozen, known = torch.ones(3, 2) > 0, torch.tensor([[True, False], [True, True], [True, True]])
     told = []
 
-    def watched(splats, views, T, frozen, central, clear):
+    def watched(splats, views, T, frozen, clear):
         told.append(clear or [clearest(s, v) for s, v in zip(splats, views, strict=True)])
         return T, torch.zeros(*T.shape[:2], 6, 6, dtype=torch.float64)
 
