@@ -13,6 +13,7 @@ from rich.progress import Progress
 
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.errors import InputError
+from splatart_ns.plugin import stage_run
 from splatart_ns.plugin.companion import Companions
 from splatart_ns.plugin.fit import Report, Settings, _semantic_config, _train
 from splatart_ns.plugin.stage_run import num_processes, run_side_by_side, run_stage
@@ -121,6 +122,13 @@ def test_a_run_ends_with_the_process_that_started_it(configs):
         assert process.wait(timeout=30) == 1
     finally:
         process.kill()
+
+
+@pytest.mark.parametrize(("threads", "processes"), [("1", 1), ("8", 2)])
+def test_a_gpu_trains_two_runs_at_most(monkeypatch, threads, processes):
+    monkeypatch.setattr(stage_run, "default_device", lambda: "cuda")
+    monkeypatch.setitem(os.environ, "OMP_NUM_THREADS", threads)
+    assert num_processes(5) == processes
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU trains two at most")
