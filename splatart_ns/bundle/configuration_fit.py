@@ -14,7 +14,7 @@ from splatart_ns.bundle.posing import configured_motions, joint_motion, normaliz
 from splatart_ns.capture.capture import Normalization
 from splatart_ns.capture.view import View
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.part_pair import PartView, best_views, huber, part_view
+from splatart_ns.stages.part_pair import PartView, best_views, huber_cost, part_view
 from splatart_ns.stages.refinement import linearized
 
 _COARSE, _FINE = (5, 1500), (12, 10000)
@@ -124,7 +124,7 @@ def _cost(splat: Splat, looks: Sequence[PartView], T: Tensor) -> Tensor:
     """Mean Huber cost per own pixel of motions T [K, 4, 4]: [K] float64."""
     total = torch.zeros(len(T), dtype=torch.float64)
     for look in looks:
-        total += (huber(look.difference(splat, T)).sum(-1) * look.weight).sum((1, 2)).double()
+        total += huber_cost(*look.difference(splat, T))
     return total / max(sum(look.area / look.factor**2 for look in looks), 1.0)
 
 
@@ -147,7 +147,7 @@ def _refine(
             k = moves.nonzero()[:, 0]
             tried = motions[name][torch.cat([k.new_zeros(1), k + 1])]
             for look in looks[name]:
-                part_H, part_g, part_cost = linearized(look.difference(splat, tried), look.weight, _STEP)
+                part_H, part_g, part_cost = linearized(*look.difference(splat, tried), _STEP)
                 H[k[:, None], k] += part_H
                 g[k] += part_g
                 cost += part_cost

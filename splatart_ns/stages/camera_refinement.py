@@ -12,7 +12,7 @@ from torch import Tensor
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import inverse, se3_exp, se3_log, transform_points
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.part_pair import PartView, huber, part_view
+from splatart_ns.stages.part_pair import PartView, huber_cost, part_view
 from splatart_ns.stages.refinement import STEP, increment, linearized, trial_steps
 
 TURN, MOVE = math.radians(0.5), 0.005
@@ -83,7 +83,7 @@ def _refined(splat: Splat, seen: PartView, given: Tensor, centroid: Tensor, radi
 
     steps = trial_steps(6, viewmat)
     motions = increment(eye.expand(len(steps), 4, 4), steps, centroid, radius)
-    H, g, cost = linearized(seen.difference(splat, motions, first_order=True), seen.weight)
+    H, g, cost = linearized(*seen.difference(splat, motions, first_order=True))
     noise = 2 * cost / float(seen.weight.sum())
     r, *after = far(motions)
     J = (torch.stack(after) - r) / STEP
@@ -92,8 +92,8 @@ def _refined(splat: Splat, seen: PartView, given: Tensor, centroid: Tensor, radi
     for _ in range(3):
         motion = increment(eye, step, centroid, radius)
         r = far(motion[None])[0]
-        image = huber(seen.difference(splat, motion[None])) * seen.weight[..., None]
-        if float(image.sum()) + 0.5 * noise * float(r @ precision @ r) < most:
+        image = huber_cost(*seen.difference(splat, motion[None]))
+        if float(image) + 0.5 * noise * float(r @ precision @ r) < most:
             return viewmat @ motion
         step = step / 3
     return viewmat

@@ -12,39 +12,41 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 REACH = 2
-"""Pixels to each side over which a mean goes, twice."""
+"""Pixels to each side over which a mean goes, twice (`_mean` is written for two)."""
 DARK = 0.02
 """Added to means of brightness before they are divided: that of black says nothing."""
 MOST = 3.0
 """A light is at most so many times brighter or darker than the other."""
 
 
-def in_even_light(rgba: Tensor, wanted: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Pictures [K, H, W, 4] lit as the `wanted` one [H, W, 4] is, and how far inside both silhouettes pixels lie
-    [K, H, W], 0..1: towards the edges means have little to go by.
+def even_light(rgba: Tensor, wanted: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """By what colours of pictures [K, H, W, 4] are multiplied [K, H, W] to be lit as the `wanted` one [H, W, 4] is, and
+    how far inside both silhouettes pixels lie [K, H, W], 0..1: towards the edges means have little to go by.
 
     All are colours over black with their silhouettes, 0..1. Pixels of `weight` [H, W] 0 count in no mean.
     """
     shown, light = _lit(rgba, weight)
     shown_wanted, light_wanted = _lit(wanted[None], weight)
-    gain = (light_wanted / light).clamp_(1 / MOST, MOST)
-    return rgba * pad(gain[..., None].expand(*gain.shape, 3), (0, 1), value=1.0), shown.mul_(shown_wanted)
+    return (light_wanted / light).clamp_(1 / MOST, MOST), shown.mul_(shown_wanted)
 
 
 def _lit(rgba: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Of pictures [K, H, W, 4] how much of the part is around, and how it is lit there: [K, H, W]."""
     bright = rgba @ torch.tensor([1 / 3, 1 / 3, 1 / 3, 0]).to(rgba)
-    around, shown = _mean(torch.stack([bright, rgba[..., 3]]).mul_(weight))
+    around, shown = _mean(torch.stack([bright, rgba[..., 3]]), weight)
     return shown, (around / (shown + DARK)).add_(DARK)
 
 
-def _mean(x: Tensor) -> Tensor:
-    """Means [..., H, W] over squares, twice; outside is 0. Shifted pictures are added: pooling takes 5 times longer."""
+def _mean(x: Tensor, weight: Tensor) -> Tensor:
+    """Means [..., H, W] over squares, twice, of x times `weight` [H, W]; outside is 0. Overwrites x.
+
+    Shifted pictures are added, each five as four and one: pooling takes 5 times longer.
+    """
+    x *= weight / (2 * REACH + 1) ** 4
     for dim, sides in ((-1, (REACH, REACH)), (-2, (0, 0, REACH, REACH))):
         for _ in range(2):
             padded, size = pad(x, sides), x.shape[dim]
-            x = padded.narrow(dim, 0, size).clone()
-            for shift in range(1, 2 * REACH + 1):
-                x += padded.narrow(dim, shift, size)
-            x /= 2 * REACH + 1
+            two = padded.narrow(dim, 0, size + 2) + padded.narrow(dim, 1, size + 2)
+            x = two.narrow(dim, 0, size) + two.narrow(dim, 2, size)
+            x += padded.narrow(dim, 4, size)
     return x

@@ -16,7 +16,7 @@ from splatart_ns.geometry.se3 import inverse
 from splatart_ns.geometry.similarity import inverse_similarity, view_of_moved
 from splatart_ns.rasterize.rasterization import rasterization, rasterize_neighbours, sh_colors
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.light import in_even_light
+from splatart_ns.stages.light import even_light
 from splatart_ns.threads import side_by_side
 
 Measure = TypeVar("Measure")
@@ -84,23 +84,28 @@ class PartView:
         T: Tensor,
         chroma_weight: float = RGB_WEIGHT,
         brightness_weight: float = RGB_WEIGHT,
-        even_light: bool = False,
+        in_even_light: bool = False,
         first_order: bool = False,
-    ) -> Tensor:
-        """How the splat under motions [K, 4, 4] differs from the part [K, H, W, 4]; see `render`."""
+    ) -> tuple[Tensor, Tensor]:
+        """How the splat under motions [K, 4, 4] differs from the part [K, N, 4], and the weights [N], of the N pixels
+        that count and where one of them shows; see `render`."""
         rendered = self.render(splat, T, first_order)
-        inside = None
-        if even_light:
-            rendered, inside = in_even_light(rendered, self.rgba, self.weight)
-        change = rendered - self.rgba
+        # A turned or thin part fills little of its piece.
+        shown = ((rendered[..., 3] != 0).any(0) | (self.rgba[..., 3] != 0)) & (self.weight > 0)
+        shown = shown.flatten().nonzero()[:, 0]
+        change = rendered.flatten(1, 2).index_select(1, shown)
+        if in_even_light:
+            gain, inside = (x.flatten(1)[:, shown] for x in even_light(rendered, self.rgba, self.weight))
+            change[..., :3] *= gain[..., None]
+        change -= self.rgba.flatten(0, 1)[shown]
         mean = torch.full((3, 3), 1 / 3).to(rendered)
         mix = torch.eye(4).to(rendered)  # by a matrix: sums over channels take several times longer
-        mix[:3, :3] = chroma_weight * (mix[:3, :3] - mean) + (0 if even_light else brightness_weight) * mean
+        mix[:3, :3] = chroma_weight * (mix[:3, :3] - mean) + (0 if in_even_light else brightness_weight) * mean
         difference = change @ mix
-        if inside is not None:
+        if in_even_light:
             brighter = change @ F.pad(mean[0], (0, 1))
             difference[..., :3] += inside.mul_(brightness_weight).mul_(brighter)[..., None]
-        return difference
+        return difference, self.weight.flatten()[shown]
 
 
 def part_view(
@@ -207,8 +212,8 @@ class PartPair:
     def of_views(
         self, T: Tensor, measure: Callable[[Tensor, Tensor], Measure], first_order: bool = False
     ) -> list[Measure]:
-        """What `measure` says, view by view, of the differences [K, H, W, 4] under motions T [K, 4, 4] and the pixels'
-        weights [H, W].
+        """What `measure` says, view by view, of the differences [K, N, 4] under motions T [K, 4, 4] and the weights [N]
+        of the pixels where anything shows.
 
         First the source's Gaussians moved by T in the target's views, then the target's moved back in the source's. T
         may be similarities. With `first_order`, all are near the first (see `PartView.render`).
@@ -220,7 +225,7 @@ class PartPair:
         @torch.no_grad()
         def look(seen: tuple[Splat, PartView, Tensor]) -> Measure:
             splat, view, motion = seen
-            return measure(view.difference(splat, motion, *looks_at), view.weight)
+            return measure(*view.difference(splat, motion, *looks_at))
 
         return side_by_side(look, looks)
 
@@ -231,13 +236,17 @@ class PartPair:
 
     def cost(self, T: Tensor) -> Tensor:
         """Mean Huber cost per own pixel of motions T [K, 4, 4]: [K] float64."""
-        costs = self.of_views(T, lambda difference, weight: (huber(difference).sum(-1) * weight).sum((1, 2)).double())
-        return sum(costs) / max(self.area, 1.0)
+        return sum(self.of_views(T, huber_cost)) / max(self.area, 1.0)
 
 
 def huber(r: Tensor) -> Tensor:
     a = r.abs()
     return torch.where(a < HUBER, 0.5 * r * r, HUBER * (a - 0.5 * HUBER))
+
+
+def huber_cost(difference: Tensor, weight: Tensor) -> Tensor:
+    """Of differences [K, N, 4] of pixels that weigh [N]: [K] float64."""
+    return (huber(difference).sum(-1) * weight).sum(1).double()
 
 
 def part_pair(

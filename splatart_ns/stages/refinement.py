@@ -104,8 +104,8 @@ def linearized(difference: Tensor, weight: Tensor, step: float = STEP) -> tuple[
     """Gauss-Newton's H [n, n] and g [n] of the Huber cost of one view, float64, and that cost.
 
     Args:
-        difference: What differs [1 + n, H, W, C]: at the point, and after a step along each parameter.
-        weight: Of the pixels [H, W].
+        difference: What differs [1 + n, N, C]: at the point, and after a step along each parameter.
+        weight: Of the pixels [N].
         step: Length of the steps, in the parameters' units.
     """
     r = difference[0].reshape(-1)

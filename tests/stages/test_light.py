@@ -3,7 +3,12 @@
 import pytest
 import torch
 
-from splatart_ns.stages.light import in_even_light
+from splatart_ns.stages.light import even_light
+
+
+def in_even_light(rgba: torch.Tensor, wanted: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    gain, inside = even_light(rgba, wanted, weight)
+    return torch.cat([rgba[..., :3] * gain[..., None], rgba[..., 3:]], -1), inside
 
 
 def difference_in_even_light(rgba: torch.Tensor, wanted: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:

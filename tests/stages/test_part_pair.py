@@ -110,7 +110,9 @@ def test_a_change_of_hue_counts_for_more_than_one_of_brightness(scene):
 
     def change(rgb, **weight):
         changed = replace(piece, rgba=piece.rgba + torch.cat([shift * torch.tensor(rgb), 0 * shift], dim=-1))
-        return (changed.difference(empty, EYE[None], **weight) - piece.difference(empty, EYE[None], **weight)).norm()
+        return (
+            changed.difference(empty, EYE[None], **weight)[0] - piece.difference(empty, EYE[None], **weight)[0]
+        ).norm()
 
     brighter, redder = (1.0, 1.0, 1.0), (2**0.5, -(2**-0.5), -(2**-0.5))
     assert change(redder) == pytest.approx(float(change(brighter)), rel=1e-3)
