@@ -31,12 +31,12 @@ WHOLE = 0.35
 """Up to this opacity alpha is below 1/255, so that nobody draws it, where gsplat's Gaussians end, at 3 deviations."""
 
 
-def scene(count: int, width: int, channels: int = 3, opacity: float = 1.0, device: str = "cuda") -> dict:
-    """Arguments of `rasterization`."""
+def scene(count: int, width: int, channels: int = 3, opacity: float = 1.0) -> dict:
+    """Arguments of `rasterization`, on CUDA."""
     given = two_part_object(count, width) | {"width": width, "height": width}
     given["opacities"] = given["opacities"] * opacity
     given["colors"] = torch.rand(count, channels, generator=torch.Generator().manual_seed(1))
-    return {name: x.to(device) if torch.is_tensor(x) else x for name, x in given.items()}
+    return {name: x.cuda() if torch.is_tensor(x) else x for name, x in given.items()}
 
 
 def outcome(given: dict, backend: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:

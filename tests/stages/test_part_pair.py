@@ -120,6 +120,19 @@ def test_a_change_of_hue_counts_for_more_than_one_of_brightness(scene):
     assert change(brighter, chroma_weight=CHROMA_WEIGHT) == pytest.approx(float(change(brighter)), rel=1e-3)
 
 
+def test_no_pixel_is_left_out_where_something_shows(scene):
+    (splat, other), views = scene
+    part = other.select(other.part_ids == 2)
+    T = torch.stack([EYE, motion((0, 0, 25), (0.3, 0.0, 0.0))])
+    for view in views[0][:3]:
+        piece = part_view(view, 2)
+        difference, weight = piece.difference(part, T, chroma_weight=1.0, brightness_weight=1.0)
+        everywhere = piece.render(part, T) - piece.rgba
+        expected = (everywhere.square().sum(-1) * piece.weight).sum((1, 2))
+        torch.testing.assert_close((difference.square().sum(-1) * weight).sum(1), expected)
+        assert len(weight) < piece.weight.numel() and (weight > 0).all()
+
+
 def test_in_even_light_colours_that_are_darker_alike_cost_no_more_than_grey_ones(scene):
     """A saturated colour that is lit less has less of its hue, too."""
     (splat, other), views = scene
