@@ -69,9 +69,10 @@ def predicted_parts(accumulation: Tensor, features: Tensor, ids: Tensor) -> Tens
 class ArticulatedSplat:
     """A bundle in any configuration.
 
-    A configuration `q` gives joints by name their values, as numbers, lists, arrays or tensors: radians or lengths,
-    0 where state 0 has the joint, [] or [B] for a joint of one freedom, [D] or [B, D] for one of D (`Joint.values`
-    tells their order). Joints that it does not name are at 0. Values beyond the observed limits are taken.
+    A configuration `q` gives joints, by their names or those of the parts that they move, their values, as numbers,
+    lists, arrays or tensors: radians or lengths, 0 where state 0 has the joint, [] or [B] for a joint of one freedom,
+    [D] or [B, D] for one of D (`Joint.values` tells their order). Joints that it does not name are at 0. Values beyond
+    the observed limits are taken.
     """
 
     def __init__(self, bundle: Bundle, device: torch.device | str | None = None):

@@ -107,3 +107,9 @@ class Bundle:
             ordered += joints
             open_parts += [joint.child for joint in joints]
         return ordered
+
+    def tree_joint(self, name: str) -> Joint | None:
+        """The tree's joint of this name, or else the one that moves the part of this name."""
+        joints = self.tree_joints
+        by_part = {joint.child: joint for joint in joints}
+        return next((joint for joint in joints if joint.name == name), by_part.get(name))

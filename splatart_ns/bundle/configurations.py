@@ -15,7 +15,7 @@ from splatart_ns.records import LONGEST, read_record
 
 Configuration = dict[str, float | list[float]]
 """Joint name to value, radian or length, or to as many as the joint has freedoms (`Joint.values`); joints that are not
-named are at 0, where state 0 has them."""
+named are at 0, where state 0 has them. A joint may be called by the part that it moves (`Bundle.tree_joint`)."""
 
 
 def movable_joints(bundle: Bundle) -> dict[str, Joint]:
@@ -24,16 +24,16 @@ def movable_joints(bundle: Bundle) -> dict[str, Joint]:
 
 
 def parse_settings(settings: Sequence[str], bundle: Bundle) -> Configuration:
-    """A configuration from texts `joint=value`; see `parse_value`. Values beyond the observed limits are taken."""
+    """A configuration from texts `joint=value` or `part=value`; see `parse_value`. Values beyond limits are taken."""
     configuration: Configuration = {}
     for setting in settings:
         name, equals, text = setting.partition("=")
         if not equals:
             raise InputError(f"--set: '{setting}' has no '='; write joint=value, for example door=30deg")
-        name = name.strip()
-        if name in configuration:
-            raise InputError(f"--set: joint '{name}' is set twice; set it once")
-        configuration[name] = parse_value(text, _find(name, bundle, "--set"), "--set")
+        joint = _find(name.strip(), bundle, "--set")
+        if joint.name in configuration:
+            raise InputError(f"--set: joint '{joint.name}' is set twice; set it once")
+        configuration[joint.name] = parse_value(text, joint, "--set")
     return configuration
 
 
@@ -70,8 +70,11 @@ def read_configuration(path: Path, bundle: Bundle) -> Configuration:
     record = read_record(Path(path), "give a JSON file of joint names and values, as `splatart view` saves it")
     configuration: Configuration = {}
     for name, value in record.fields.items():
-        dofs = JOINT_DOFS[_find(name, bundle, f"{path}").type]
-        configuration[name] = record.numbers(name, value, (dofs,) if dofs > 1 else ()).tolist()
+        joint = _find(name, bundle, f"{path}")
+        if joint.name in configuration:
+            raise InputError(f"{path}: joint '{joint.name}' is given twice; give it once")
+        dofs = JOINT_DOFS[joint.type]
+        configuration[joint.name] = record.numbers(name, value, (dofs,) if dofs > 1 else ()).tolist()
     return configuration
 
 
@@ -117,8 +120,8 @@ def read_trajectory(path: Path, bundle: Bundle) -> list[Configuration]:
         raise InputError(f"{path}: is no CSV text ({error}); save it as UTF-8") from error
     if len(rows) < 2:
         raise InputError(f"{path}: has {len(rows)} lines; give a header of joint names and a row of values per frame")
-    names = [cell.strip() for cell in rows[0][1]]
-    joints = [_find(name, bundle, f"{path}") for name in names]
+    joints = [_find(cell.strip(), bundle, f"{path}") for cell in rows[0][1]]
+    names = [joint.name for joint in joints]
     if len(set(names)) < len(names):
         raise InputError(f"{path}: the header names a joint twice; name each once")
     configurations = []
@@ -131,7 +134,9 @@ def read_trajectory(path: Path, bundle: Bundle) -> list[Configuration]:
 
 
 def _find(name: str, bundle: Bundle, where: str) -> Joint:
-    joints = movable_joints(bundle)
-    if name not in joints:
-        raise InputError(f"{where}: no movable joint is called '{name}'; there are {', '.join(joints) or 'none'}")
-    return joints[name]
+    """The movable joint of this name, or that moves the part of this name."""
+    joint = bundle.tree_joint(name)
+    if joint is None or JOINT_DOFS[joint.type] == 0:
+        known = ", ".join(movable_joints(bundle)) or "none"
+        raise InputError(f"{where}: no movable joint is called '{name}'; there are {known}")
+    return joint

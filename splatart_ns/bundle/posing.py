@@ -39,19 +39,22 @@ def joint_motion(joint: Joint, value: JointValue) -> Tensor:
 
 
 def configured_motions(bundle: Bundle, q: Mapping[str, JointValue]) -> dict[str, Tensor]:
-    """T[part] [..., 4, 4] float64, canonical frame to the configuration `q` (joint name to value; the others are 0).
+    """T[part] [..., 4, 4] float64, canonical frame to the configuration `q` (joint to value; the others are 0).
+
+    A joint goes by its name or by that of the part that it moves.
 
     The batches of the values broadcast. The root stays where it is at state 0, and so do parts that hang on nothing.
     Values beyond the limits are taken. Raises InputError for an unknown name, and as `joint_motion` does.
     """
     joints = bundle.tree_joints
-    names = {joint.name for joint in joints}
-    if unknown := set(q) - names:
+    called = {name: bundle.tree_joint(name) for name in q}
+    if unknown := [str(name) for name, joint in called.items() if joint is None]:
         known = ", ".join(joint.name for joint in joints) or "none"
-        raise InputError(f"no tree joint is called {', '.join(sorted(map(str, unknown)))}; there are {known}")
-    relative = {
-        joint.name: joint_motion(joint, q.get(joint.name, torch.zeros_like(joint.values[0]))) for joint in joints
-    }
+        raise InputError(f"no tree joint is called {', '.join(sorted(unknown))}; there are {known}")
+    values = {joint.name: q[name] for name, joint in called.items()}
+    if len(values) < len(q):
+        raise InputError(f"{', '.join(q)} name a joint twice, by itself and by the part that it moves; give it once")
+    relative = {j.name: joint_motion(j, values.get(j.name, torch.zeros_like(j.values[0]))) for j in joints}
     try:
         batch = torch.broadcast_shapes(*(T.shape[:-2] for T in relative.values()))
     except RuntimeError as error:

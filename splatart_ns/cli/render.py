@@ -29,12 +29,12 @@ class Render:
     configuration: Path | None = None
     """JSON file of joint values, as the viewer saves it; --set changes single ones."""
     set: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction] = ()
-    """Joint values, joint=value: radians, or degrees as 30deg, or a length; joints of several freedoms take as many,
-    lengths first: ball=10deg,0,5deg. Joints not named are as in state 0."""
+    """Joint values, joint=value, or part=value for the joint that moves it: radians, or degrees as 30deg, or a length;
+    joints of several freedoms take as many, lengths first: ball=10deg,0,5deg. Joints not named are as in state 0."""
     sweep: bool = False
     """Move one joint after the other over its observed range."""
     trajectory: Path | None = None
-    """CSV file: a header of joint names, and a row of values a frame; --set holds other joints."""
+    """CSV file: a header of joints, and a row of values a frame; --set holds other joints."""
     dataset: int | None = None
     """Write a capture with ground truth: so many images with part labels and depth at random views and configurations.
     Run it again to go on, or with more to add some."""

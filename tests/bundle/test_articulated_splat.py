@@ -145,7 +145,7 @@ def test_pictures_have_gradients_by_joint_values(solid, camera):
 @pytest.mark.parametrize(
     ("q", "found"),
     [
-        ({"door": 0.1}, "no tree joint is called door; there are hinge, slide"),
+        ({"nobody": 0.1}, "no tree joint is called nobody; there are hinge, slide"),
         ({"hinge": [0.1, 0.2], "slide": [0.1, 0.2, 0.3]}, r"different batches: hinge \[2\], slide \[3\]"),
         ({"hinge": "wide"}, "'wide' are no numbers"),
         ({"hinge": math.inf}, "not finite"),

@@ -29,9 +29,33 @@ def test_values_are_radians_and_lengths_unless_degrees_are_asked_for(bundle):
     assert parse_settings(["hinge=-90DEG"], bundle) == {"hinge": pytest.approx(-math.pi / 2)}
 
 
+def test_a_joint_may_be_called_by_the_part_that_it_moves(bundle, tmp_path):
+    assert parse_settings(["door=0.5", "slide=0.1"], bundle) == {"hinge": 0.5, "slide": 0.1}
+    (tmp_path / "q.json").write_text('{"door": 0.5}')
+    assert read_configuration(tmp_path / "q.json", bundle) == {"hinge": 0.5}
+    (tmp_path / "q.csv").write_text("latch,door\n0.1,90deg\n")
+    assert read_trajectory(tmp_path / "q.csv", bundle) == [{"slide": 0.1, "hinge": pytest.approx(math.pi / 2)}]
+
+
+def test_a_joint_called_in_both_ways_is_refused(bundle, tmp_path):
+    (tmp_path / "q.json").write_text('{"door": 0.5, "hinge": 0.5}')
+    (tmp_path / "q.csv").write_text("hinge,door\n0.1,0.1\n")
+    with pytest.raises(InputError, match="'hinge' is given twice"):
+        read_configuration(tmp_path / "q.json", bundle)
+    with pytest.raises(InputError, match="a joint twice"):
+        read_trajectory(tmp_path / "q.csv", bundle)
+
+
+def test_a_joint_that_has_the_name_of_another_ones_part_is_meant_itself(bundle):
+    next(joint for joint in bundle.joints if joint.name == "slide").name = "door"
+    assert parse_settings(["door=0.1", "hinge=0.5"], bundle) == {"door": 0.1, "hinge": 0.5}
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        (["base=1"], "called 'base'"),
+        (["hinge=1", "door=1"], "'hinge' is set twice"),
         (["hinge"], "no '='"),
         (["nobody=1"], "called 'nobody'; there are hinge, slide"),
         (["closure=1"], "closure"),
@@ -139,7 +163,7 @@ def test_a_saved_configuration_is_read(with_ball, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"door": 1}', "q.json: no movable joint is called 'door'; there are hinge, closure"),
+        ('{"nobody": 1}', "q.json: no movable joint is called 'nobody'; there are hinge, closure"),
         ('{"hinge": [1]}', "'hinge' of the file holds \\[1\\]; give a number$"),
         ('{"hinge": "30deg"}', "'hinge' of the file holds"),
         ('{"hinge": NaN}', "NaN is no number"),

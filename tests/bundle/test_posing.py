@@ -88,6 +88,14 @@ def test_a_part_that_hangs_on_nothing_stays_with_the_root(bundle):
     assert torch.equal(configured_motions(bundle, {"hinge": 1.0})["latch"], torch.eye(4, dtype=D))
 
 
+def test_a_joint_may_be_called_by_the_part_that_it_moves(bundle):
+    by_part = configured_motions(bundle, {"door": 0.3, "slide": 0.1})
+    for name, T in configured_motions(bundle, {"hinge": 0.3, "slide": 0.1}).items():
+        assert torch.equal(by_part[name], T)
+    with pytest.raises(InputError, match="hinge, door name a joint twice"):
+        configured_motions(bundle, {"hinge": 0.3, "door": 0.3})
+
+
 def test_an_unknown_joint_is_refused(bundle):
     with pytest.raises(InputError, match="no tree joint is called closure; there are hinge, slide"):
         posed_splat(bundle, {"closure": 0.0})
