@@ -46,6 +46,25 @@ def test_joints_of_parts_without_geometry_do_not_count(truth, bundle):
     assert structure_scores(truth, bundle) == {"tree_exact": True, "edges_precision": 1.0, "edges_recall": 1.0}
 
 
+def test_a_part_below_one_without_geometry_hangs_on_the_next_one_above(truth, bundle):
+    """As a bottle's cap, which slides by one joint and turns by another."""
+    door = truth.joints[0]
+    slide = replace(door, name="slide", child=None, child_name="helper", type="prismatic")
+    turn = replace(door, parent=None, parent_name="helper")
+    truth.joints[:1] = [turn, slide]
+    assert structure_scores(truth, bundle) == {"tree_exact": True, "edges_precision": 1.0, "edges_recall": 1.0}
+    bundle.joints[0].parent = "latch"
+    assert not structure_scores(truth, bundle)["tree_exact"]
+
+
+def test_a_part_with_nothing_but_parts_without_geometry_above_it_hangs_on_none(truth, bundle):
+    ring = replace(truth.joints[0], parent=None, parent_name="a")
+    a, b = (replace(ring, child=None, child_name=x, parent_name=y) for x, y in ("ab", "ba"))
+    truth.joints[:1] = [ring, a, b]
+    scores = structure_scores(truth, bundle)
+    assert not scores["tree_exact"] and scores["edges_recall"] == 1 and scores["edges_precision"] == 0.5
+
+
 def test_no_joints_have_no_precision(truth, bundle):
     bundle.joints.clear()
     assert structure_scores(truth, bundle) == {"tree_exact": False, "edges_precision": None, "edges_recall": 0.0}
