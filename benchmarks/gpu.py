@@ -174,8 +174,7 @@ def trainers(capture: Path, folder: Path) -> dict:
             new = nn.Parameter(new[:, : old.shape[1]].contiguous() if name == "features_rest" else new)
             model.gauss_params[name] = new
             optimizers[name].param_groups[0]["params"] = [new]
-        model.optimizers, model.step = optimizers, 900  # of 1000 on colours, all bands of spherical harmonics on
-        model.config.sh_degree_interval = 100
+        model.optimizers, model.config.sh_degree_interval = optimizers, 100
     return ready
 
 
@@ -188,8 +187,9 @@ def step_times(capture: Path) -> dict:
             for name, trainer in ready.items():
                 torch.cuda.synchronize()
                 start = time.perf_counter()
-                for _ in range(50):
-                    trainer.train_iteration(900)
+                for step in range(900, 950):  # of 1000 on colours, with all bands of spherical harmonics
+                    trainer.pipeline.model.step = step
+                    trainer.train_iteration(step)
                 torch.cuda.synchronize()
                 if turn > 0:
                     walls[name].append((time.perf_counter() - start) / 50 * 1e3)
