@@ -10,10 +10,14 @@ from importlib.metadata import entry_points
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
+import torch
+
 SECONDS = 300
 
-_forks = multiprocessing.get_context("forkserver")
-_forks.set_forkserver_preload(["nerfstudio.scripts.train", "nerfstudio.scripts.eval", "nerfstudio.scripts.render"])
+# Nerfstudio's modules start CUDA as they are imported, and no fork of theirs can use it.
+_forks = multiprocessing.get_context("spawn" if torch.cuda.is_available() else "forkserver")
+if not torch.cuda.is_available():
+    _forks.set_forkserver_preload(["nerfstudio.scripts.train", "nerfstudio.scripts.eval", "nerfstudio.scripts.render"])
 
 
 class Commands:
@@ -37,7 +41,7 @@ class Commands:
         return done.stdout
 
     def start(self, *argv: object) -> BaseProcess:
-        """Start a command in a fork of a process that has imported nerfstudio, which takes long, already."""
+        """Start a command, without CUDA in a fork of a process that has imported nerfstudio, which takes long, already."""
         process = _forks.Process(target=_enter, args=(list(map(str, argv)), self.folder), daemon=True)
         process.start()
         return process
