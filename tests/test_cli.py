@@ -224,7 +224,7 @@ def test_render_looks_through_a_camera_of_the_capture(run_main, hinge_fit, hinge
 
 
 def test_a_dataset_is_a_capture_without_problems(run_main, hinge_fit, tmp_path):
-    folder = tmp_path / "capture"
+    folder = tmp_path / f"capture [red] {'of a long name ' * 8}"  # which is told as it is, on one line
     code, output, errors = run_main("render", hinge_fit, "--dataset", 36, "--states", 3, "--output", folder, *SMALL)
     assert (code, errors) == (0, "") and f"Capture: {folder}" in output
     assert [len(state.frames) for state in load_capture(folder).states] == [12, 12, 12]

@@ -111,7 +111,7 @@ class Export:
         failed = False
         for form, folder in folders.items():
             path = exports.export(loaded, robot, form, folder)
-            CONSOLE.print(f"Export: {path}", soft_wrap=True)
+            print(f"Export: {path}")
             for note in exports.format_notes(robot, form):
                 CONSOLE.print(f"note: {note}", markup=False)
             if self.validate:

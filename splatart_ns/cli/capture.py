@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from splatart_ns.capture.synthesis_options import SynthesisOptions
-from splatart_ns.cli.common import CONSOLE, choose_rasterizer, device
+from splatart_ns.cli.common import choose_rasterizer, device
 from splatart_ns.errors import InputError
 
 
@@ -33,7 +33,7 @@ class Synth:
             synthesize_object(str(self.robot), self.output_dir, self.options)
         else:
             synthesize(self.robot, self.output_dir, self.options)
-        CONSOLE.print(f"Capture: {self.output_dir}")
+        print(f"Capture: {self.output_dir}")
 
 
 @dataclass

@@ -38,4 +38,4 @@ class Demo:
         Evaluate(bundle, capture).run()
         film = self.output_dir / "sweep.gif"
         Render(bundle, film, sweep=True, frames=40, fps=20, resolution=256, azimuth=-50).run()
-        CONSOLE.print(f"Look at {film}; the bundle is {bundle}")
+        print(f"Look at {film}; the bundle is {bundle}")

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from splatart_ns.cli.common import CONSOLE, Quality, Rasterizer, choose_rasterizer
+from splatart_ns.cli.common import Quality, Rasterizer, choose_rasterizer
 
 
 @dataclass
@@ -50,4 +50,4 @@ class Fit:
 
             choose_rasterizer(self.rasterizer)
             how = (self.quality, self.root, self.seed, self.rasterizer, self.joint, self.worlds, self.refine_cameras)
-            CONSOLE.print(f"Bundle: {fit(self.capture, self.output_dir, *how, companions)}")
+            print(f"Bundle: {fit(self.capture, self.output_dir, *how, companions)}")

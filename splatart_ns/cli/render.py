@@ -119,7 +119,7 @@ class Render:
         told = write_dataset(samples, self.output, self.dataset, lambda left: track(left, "Images", console=CONSOLE))
         if not told:
             CONSOLE.print("note: no ground_truth.json, which cannot tell screws and joints of several freedoms")
-        CONSOLE.print(f"Capture: {self.output}")
+        print(f"Capture: {self.output}")
 
     def _write_frames(self, splat: ArticulatedSplat) -> None:
         from splatart_ns.bundle import animation, configurations
@@ -146,4 +146,4 @@ class Render:
             sphere, elevation = cameras.bounding_sphere(bundle, path), math.radians(self.elevation)
             view = cameras.orbit_camera(*sphere, azimuth, elevation, self.resolution, self.resolution)
         images = animation.render_frames(splat, path, view, self.channel, self.background)
-        CONSOLE.print(f"{animation.write_frames(images, self.output, self.fps)} frames: {self.output}")
+        print(f"{animation.write_frames(images, self.output, self.fps)} frames: {self.output}")

@@ -359,7 +359,7 @@ class JointTrainer(Trainer):
         folder = self.config.bundle_dir or self.base_dir / "bundle"
         save_bundle(self.pipeline.bundle, folder)
         self.save_checkpoint(self.step)
-        CONSOLE.print(f"Bundle: {folder}\nConfig: {self.base_dir / 'config.yml'}", markup=False)
+        print(f"Bundle: {folder}\nConfig: {self.base_dir / 'config.yml'}")  # CONSOLE breaks lines
         self._init_viewer_state()
         self.pipeline.eval()
         if not self.config.viewer.quit_on_train_completion:

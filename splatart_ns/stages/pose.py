@@ -44,15 +44,16 @@ class PartPoses(nn.Module):
         S, P = base.shape[:2]
         if not torch.equal(base[0], torch.eye(4).to(base[0]).expand(P, 4, 4)):
             raise ValueError("the poses of state 0 must be the identity")
-        free = torch.ones(S - 1, P, dtype=torch.bool) if frozen is None else ~frozen[1:]
+        device = base.device
+        free = torch.ones(S - 1, P, dtype=torch.bool, device=device) if frozen is None else ~frozen[1:]
         self.register_buffer("base", base.double())
         self.register_buffer("centroids", centroids.double())
         self.register_buffer("radii", radii.double())
         self.register_buffer("free", free)
         self.register_buffer("turning", torch.ones_like(free), persistent=False)
-        self.rotation = nn.Parameter(torch.zeros(S - 1, P, 3, dtype=torch.float64))
+        self.rotation = nn.Parameter(torch.zeros(S - 1, P, 3, dtype=torch.float64, device=device))
         """Rotation vectors [S - 1, P, 3], radians."""
-        self.translation = nn.Parameter(torch.zeros(S - 1, P, 3, dtype=torch.float64))
+        self.translation = nn.Parameter(torch.zeros(S - 1, P, 3, dtype=torch.float64, device=device))
         """Shifts [S - 1, P, 3] in units of the part's radius."""
 
     def T(self) -> Tensor:

@@ -41,7 +41,7 @@ class Commands:
         return done.stdout
 
     def start(self, *argv: object) -> BaseProcess:
-        """Start a command, without CUDA in a fork of a process that has imported nerfstudio, which takes long, already."""
+        """Start a command; without CUDA in a fork of a process that has imported nerfstudio, which takes long."""
         process = _forks.Process(target=_enter, args=(list(map(str, argv)), self.folder), daemon=True)
         process.start()
         return process
