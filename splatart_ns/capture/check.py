@@ -14,6 +14,7 @@ from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame
 from splatart_ns.capture.formats import read_capture
 from splatart_ns.capture.images import read_depth_for, read_image, read_labels, read_mask, read_sized
 from splatart_ns.capture.view import load_points
+from splatart_ns.capture.worlds import OTHER_WORLDS_MEND, looks_elsewhere
 from splatart_ns.errors import InputError
 
 
@@ -52,6 +53,8 @@ def check_structure(path: Path) -> tuple[Capture | None, list[Problem]]:
     problems.extend(_check_duplicates(capture))
     for state in capture.states:
         problems.extend(_check_cameras(capture, state))
+        if (strange := looks_elsewhere(capture, state)) is not None:
+            problems.append(Problem("warning", capture.path / state.name, strange, OTHER_WORLDS_MEND))
         problems.extend(_check_silhouettes(capture, state, [by_frame[id(f)] for f in state.frames]))
         problems.extend(_check_points(state))
     pixels = [sum((by_frame[id(f)].pixels for f in s.split("train")), np.zeros(256, int)) for s in capture.states]

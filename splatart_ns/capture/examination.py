@@ -19,6 +19,7 @@ from splatart_ns.capture.hull import carve, fitting_views, project, silhouette, 
 from splatart_ns.capture.part_votes import Ballot, PartVotes, read_ballots, vote
 from splatart_ns.capture.seen_surface import LEAST_CONFIRMED, measured_surface, object_pixels
 from splatart_ns.capture.view import View, load_view
+from splatart_ns.capture.worlds import OTHER_WORLDS_MEND
 from splatart_ns.errors import InputError
 
 _PIXELS = 256
@@ -366,7 +367,7 @@ def _check_motion(capture: Capture, first: _Evidence, other: _Evidence) -> Itera
         )
     if len(known) and bool((known < _MOVES).all()):
         found = f"no part is where it was in {first.state.name}: the states may have different worlds or labels"
-        mend = "fit it with --worlds similar (rigid if lengths are measured), or correct the ids of the parts"
+        mend = f"{OTHER_WORLDS_MEND}, or correct the ids of the parts"
         yield Problem("warning", place, found, mend)
 
 

@@ -13,8 +13,10 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from splatart_ns.capture.capture import State
 from splatart_ns.capture.seen_surface import LEAST_CONFIRMED
 from splatart_ns.capture.view import View
+from splatart_ns.capture.worlds import OTHER_WORLDS_MEND, looks_elsewhere
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
@@ -222,18 +224,23 @@ class SemanticPipeline(VanillaPipeline):
         wanted = self.model.config.refine_cameras
         self._refines = wanted == "on" or (wanted == "auto" and self._slack.pixels > 0)
         if self._slack.pixels > 0 and not self._refines:
-            state = self.datamanager.capture.states[self.datamanager.dataparser.config.state].name
             self.notes.append(
-                f"{state}: the silhouettes contradict each other by {self._slack.pixels} pixels, so cameras or masks "
-                "are not exact; --refine-cameras off leaves them so."
+                f"{self._state.name}: the silhouettes contradict each other by {self._slack.pixels} pixels, so cameras "
+                "or masks are not exact; --refine-cameras off leaves them so."
             )
         dataset = self.datamanager.train_dataset
         self._labelled = {i for i, frame in enumerate(dataset.metadata["frames"]) if frame.labels is not None}
         if self.datamanager.test_mode == "val":
+            if (strange := looks_elsewhere(self.datamanager.capture, self._state)) is not None:
+                self.notes.append(f"{self._state.name}: {strange}; {OTHER_WORLDS_MEND}.")
             self._note_depth()
             self._views = list(dataset.views)
             self._given = torch.stack([view.viewmat for view in self._views]).double()
             self.model.viewmats = self._given.to(self.device)
+
+    @property
+    def _state(self) -> State:
+        return self.datamanager.capture.states[self.datamanager.dataparser.config.state]
 
     def _note_depth(self) -> None:
         """Say so where frames have a depth that others contradict."""
@@ -241,10 +248,9 @@ class SemanticPipeline(VanillaPipeline):
         if any(view.depth is not None for view in self.datamanager.measured.views):
             self.findings["depth"] = {"confirmed": round(share, 3)}
             if share < LEAST_CONFIRMED:
-                state = self.datamanager.capture.states[self.datamanager.dataparser.config.state].name
                 self.notes.append(
-                    f"{state}: other frames confirm {share:.0%} of the frames' depth, so it is not used; a count must "
-                    "be depth_unit_scale_factor (0.001 if that is missing) of the poses' unit."
+                    f"{self._state.name}: other frames confirm {share:.0%} of the frames' depth, so it is not used; a "
+                    "count must be depth_unit_scale_factor (0.001 if that is missing) of the poses' unit."
                 )
 
     def get_train_loss_dict(self, step: int):
@@ -305,9 +311,8 @@ class SemanticPipeline(VanillaPipeline):
             change = camera_change(model.viewmats, self._given)
             before, now = self.datamanager.slack.pixels, self._slack.pixels
             self.findings["cameras"] = {**asdict(change), "slack_pixels": [before, now]}
-            state = self.datamanager.capture.states[self.datamanager.dataparser.config.state].name
             self.notes.append(
-                f"{state}: the cameras contradicted each other by {before} pixels; they were turned by "
+                f"{self._state.name}: the cameras contradicted each other by {before} pixels; they were turned by "
                 f"{change.degrees:.2f} deg and moved by {change.percent:.2f} % of their distance, and now do so by "
                 f"{now}."
             )
@@ -327,8 +332,9 @@ class SemanticPipeline(VanillaPipeline):
                 data["image"][..., :3] = at_gain(data["image"][..., :3], found[data["image_idx"]])
         if due[-1] == EVENED[-1] and uneven > UNEVEN:
             self.findings["exposure"] = {"log_deviation": uneven}
-            state = self.datamanager.capture.states[self.datamanager.dataparser.config.state].name
-            self.notes.append(f"{state}: the frames' exposures differ by {100 * uneven:.0f} %; they were evened.")
+            self.notes.append(
+                f"{self._state.name}: the frames' exposures differ by {100 * uneven:.0f} %; they were evened."
+            )
 
     def _vote(self, step: int) -> None:
         """Where the second phase begins: which frames' labels to trust, and what they say together."""

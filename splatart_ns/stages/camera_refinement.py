@@ -122,7 +122,10 @@ def _without_drift(viewmats: Tensor, given: Tensor, centroid: Tensor) -> Tensor:
     common = se3_exp(se3_log(motions).mean(0))
     viewmats = viewmats @ to_centroid @ inverse(common) @ inverse(to_centroid)
     before, after = (transform_points(V, centroid[None])[:, 0] for V in (given, viewmats))
-    nearer = (after[:, 2] / before[:, 2]).log().mean().exp()
+    in_front = torch.minimum(before, after)[:, 2] > 0
+    if not in_front.any():
+        return viewmats
+    nearer = (after[in_front, 2] / before[in_front, 2]).log().mean().exp()
     out = viewmats.clone()
     out[:, :3, 3] += after / nearer - after
     return out

@@ -150,6 +150,18 @@ def test_cameras_on_one_spot_are_an_error(capture_folder, edit):
     assert found(check_capture(capture_folder)) == ["state_00: all training cameras stand on one spot"]
 
 
+def test_a_state_in_another_world_is_a_warning(capture_folder, edit):
+    def change(meta):
+        for frame in meta["frames"]:
+            frame["transform_matrix"][0][3] += 50
+
+    edit(capture_folder / "state_01/transforms.json", change)
+    (warning,) = [p for p in check_capture(capture_folder) if "look" in p.message]
+    assert (warning.severity, warning.file.name) == ("warning", "state_01") and "--worlds similar" in warning.mend
+    edit(capture_folder / "state_01/transforms.json", lambda meta: meta.update(worlds="similar"))
+    assert not [p for p in check_capture(capture_folder) if "look" in p.message]
+
+
 def test_a_state_without_training_views_is_an_error(capture_folder, edit):
     edit(capture_folder / FILE, lambda m: m.update(train_filenames=[]))
     errors = found(check_capture(capture_folder))

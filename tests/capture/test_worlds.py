@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from splatart_ns.capture.capture import CaptureError
 from splatart_ns.capture.formats import load_capture
-from splatart_ns.capture.worlds import focus_on_focus, in_one_world
+from splatart_ns.capture.worlds import focus_on_focus, in_one_world, looks_elsewhere
 
 
 @pytest.fixture
@@ -68,6 +69,16 @@ def test_states_come_side_by_side_with_or_without_their_scale(capture, worlds, d
 
 def test_a_shared_world_stays(capture):
     assert np.array_equal(poses(focus_on_focus(capture, "shared"), 1), poses(capture, 1))
+
+
+@pytest.mark.parametrize(("scale", "shift", "strange"), [(1, 0, False), (1.2, 0.1, False), (1, 3, True), (4, 0, True)])
+def test_states_of_different_worlds_are_told(capture, scale, shift, strange):
+    T = np.diag([scale, scale, scale, 1.0])
+    T[0, 3] = shift
+    moved = in_one_world(capture, np.stack([np.eye(4), T]))
+    told = [looks_elsewhere(moved, state) for state in moved.states]
+    assert told[0] is None and (told[1] is not None) == strange
+    assert looks_elsewhere(replace(moved, worlds="similar"), moved.states[1]) is None
 
 
 @pytest.mark.parametrize("value", ["similar", "everywhere", ["rigid"]])

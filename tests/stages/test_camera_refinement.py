@@ -62,6 +62,14 @@ def test_what_all_cameras_have_in_common_stays(scene):
     assert change.degrees < 0.5 and change.percent < 1  # of 1.3 degrees and 2 percent
 
 
+def test_cameras_that_look_away_stay_finite(scene):
+    splat, views = scene
+    back = torch.diag(torch.tensor([1.0, -1, -1, 1]))
+    for count in (1, len(views)):
+        seen = [replace(v, viewmat=back @ v.viewmat) if k < count else v for k, v in enumerate(views)]
+        assert refine_cameras(splat, seen, viewmats(views), 500).isfinite().all()
+
+
 def test_views_without_a_silhouette_stay(scene):
     splat, views = scene
     wrong = [replace(v, alpha=None) if k == 3 else v for k, v in enumerate(jittered(views, 0.01))]
