@@ -149,7 +149,7 @@ class _Worker:
     def _spawn(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, other = context.Pipe()
-        self._words = tempfile.NamedTemporaryFile(prefix="splatart-batch-", suffix=".log")
+        self._words = tempfile.NamedTemporaryFile(prefix="splatart-batch-", suffix=".log", delete=False)
         self.process = context.Process(target=_serve, args=(other, self._words.name), daemon=True)
         told = THREADS | {"CUDA_VISIBLE_DEVICES": self.gpu}
         with _ENVIRONMENT:
@@ -168,6 +168,7 @@ def _serve(pipe: Connection, words: str) -> None:
     """The process: run what comes through the pipe, until the other end closes it or dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that ends this one
     log = os.open(words, os.O_WRONLY | os.O_APPEND)
+    os.unlink(words)  # who started this has it open, and nothing is left, however both end
     for stream in (1, 2):
         os.dup2(log, stream)
     parent = multiprocessing.parent_process()
@@ -177,5 +178,5 @@ def _serve(pipe: Connection, words: str) -> None:
             function, arguments = pipe.recv()
         except EOFError:
             return
-        os.truncate(words, 0)  # the last words are those of the task
+        os.ftruncate(log, 0)  # the last words are those of the task
         pipe.send(function(*arguments))

@@ -48,6 +48,13 @@ def test_a_task_waits_until_its_memory_is_free_and_starts_at_last(pool):
     assert pool.fits(Needs(memory_mb=5000))  # more than there is: alone
 
 
+def test_a_process_leaves_no_file_behind_even_if_it_is_killed(pool, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    pool = pool(1, 1000, 0)
+    pool.start("a", Needs(), os.listdir, tmp_path)
+    assert results(pool, 1) == {"a": []}
+
+
 def test_a_process_that_dies_takes_its_own_task_alone(pool):
     pool = pool(2, 1000, 0)
     pool.start("ends", Needs(), os._exit, 7)
