@@ -38,7 +38,7 @@ def focus_on_focus(capture: Capture, worlds: Worlds) -> Capture:
 
 APART, UNLIKE = 1.0, 3.0
 """States of one world hardly ever have cameras that look so far apart, in half widths of what they see there, or see so
-many times as much. (Of 196 captures they looked within 0.01, and saw 1.002 times as much at most.)"""
+many times as much. (Of 196 pairs of states they looked within 0.01, and saw 1.002 times as much at most.)"""
 
 
 def looks_elsewhere(capture: Capture, state: State) -> str | None:
