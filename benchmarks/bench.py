@@ -65,6 +65,9 @@ def main(options: Options) -> None:
     plan = [point for point in plan if options.only is None or options.only in point.key]
     results = folder / "results.jsonl"
     records = read(results)
+    kept = sum(point.key in records for point in plan)
+    if kept:
+        print(f"{kept} of {len(plan)} fits are kept from an earlier run: remove {results} to run them again", flush=True)
     for number, point in enumerate(plan):
         if point.key in records:
             continue

@@ -68,6 +68,8 @@ def write_report(
     """All that is known of the planned fits; None for those that were not run."""
     known = [r for r in records if r is not None]
     done = [r for r in known if "failed" not in r]
+    if known:  # some or all may have been kept from an earlier run
+        machine = machine | {"commit": " and ".join(sorted({r["machine"]["commit"] for r in known}))}
     text = [head(plan, known, machine, flags)]
     trades = [r for r in done if r["size"] is None and r["group"] != "profile"]
     if trades:

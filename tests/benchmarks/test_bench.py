@@ -91,6 +91,16 @@ def test_the_document_has_fronts_ratios_and_what_was_left_out(tmp_path):
     assert all((tmp_path / "images" / f"bench_{name}.png").stat().st_size > 0 for name in ("settings", "stages"))
 
 
+def test_fits_kept_from_an_earlier_run_are_told_to_be_of_its_version(tmp_path):
+    plan = trade_offs(QUICK, [])[:2]
+    records = [record(point, 10.0, 1.0) for point in plan]
+    for kept in records:
+        kept["machine"] = kept["machine"] | {"commit": "earlier"}
+    assert "Commit earlier, " in written(tmp_path, plan, records)
+    records[1]["machine"]["commit"] = "later"
+    assert "Commit earlier and later, " in written(tmp_path, plan, records)
+
+
 def test_the_document_says_when_the_machine_was_busy_and_what_failed(tmp_path):
     plan = trade_offs(QUICK, [])[:2]
     busy = record(plan[0], 10.0, 1.0, load=4.0)
