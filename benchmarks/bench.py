@@ -67,9 +67,7 @@ def main(options: Options) -> None:
     records = read(results)
     kept = sum(point.key in records for point in plan)
     if kept:
-        print(
-            f"{kept} of {len(plan)} fits are kept from an earlier run; remove {results} to fit again", flush=True
-        )
+        print(f"{kept} of {len(plan)} fits are kept from an earlier run; remove {results} to fit again", flush=True)
     for number, point in enumerate(plan):
         if point.key in records:
             continue
