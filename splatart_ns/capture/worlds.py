@@ -7,7 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatart_ns.capture.capture import Capture, Normalization, State, Worlds
+from splatart_ns.capture.capture import Capture, State, Worlds
+
+APART, UNLIKE = 1.0, 3.0
+"""States of one world hardly ever have cameras that look so far apart, in half widths of what they see there, or see so
+many times as much. (Of 196 pairs of states they looked within 0.01, and saw 1.002 times as much at most.)"""
+OTHER_WORLDS_MEND = "fit it with --worlds similar (rigid if lengths are measured)"
 
 
 def in_one_world(capture: Capture, T: np.ndarray | Sequence[Sequence[Sequence[float]]]) -> Capture:
@@ -36,24 +41,16 @@ def focus_on_focus(capture: Capture, worlds: Worlds) -> Capture:
     return replace(in_one_world(capture, T), worlds=worlds)
 
 
-APART, UNLIKE = 1.0, 3.0
-"""States of one world hardly ever have cameras that look so far apart, in half widths of what they see there, or see so
-many times as much. (Of 196 pairs of states they looked within 0.01, and saw 1.002 times as much at most.)"""
-
-
 def looks_elsewhere(capture: Capture, state: State) -> str | None:
     """What is strange about where a state's cameras look, if it is said to share the world of the first; else None."""
-    if capture.worlds != "shared" or not all(s.split("train") for s in (capture.states[0], state)):
+    if capture.worlds != "shared":
         return None
-    first, own = (Normalization.from_frames(s.split("train")) for s in (capture.states[0], state))
+    first, own = capture.states[0].normalization(), state.normalization()
     apart = np.linalg.norm(own.centre - first.centre) * min(own.scale, first.scale)
     times = max(own.scale / first.scale, first.scale / own.scale)
     if apart < APART and times < UNLIKE:
         return None
     return f"its cameras do not look where those of {capture.states[0].name} do: the states may have different worlds"
-
-
-OTHER_WORLDS_MEND = "fit it with --worlds similar (rigid if lengths are measured)"
 
 
 def _placed(state: State, T: np.ndarray) -> State:

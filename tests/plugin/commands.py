@@ -16,8 +16,7 @@ SECONDS = 300
 
 # Nerfstudio's modules start CUDA as they are imported, and no fork of theirs can use it.
 _forks = multiprocessing.get_context("spawn" if torch.cuda.is_available() else "forkserver")
-if not torch.cuda.is_available():
-    _forks.set_forkserver_preload(["nerfstudio.scripts.train", "nerfstudio.scripts.eval", "nerfstudio.scripts.render"])
+_forks.set_forkserver_preload(["nerfstudio.scripts.train", "nerfstudio.scripts.eval", "nerfstudio.scripts.render"])
 
 
 class Commands:

@@ -109,6 +109,20 @@ def test_depth_is_not_read_where_nothing_learns(depth_capture_dir, semantic_trai
     assert not pipeline.findings and "views" not in pipeline.datamanager.train_dataset.__dict__
 
 
+@pytest.mark.parametrize("state", [0, 1])
+def test_a_state_of_another_world_is_told(capture_dir, semantic_trainer, tmp_path, state):
+    capture = shutil.copytree(capture_dir, tmp_path / "capture")
+    file = capture / "state_01/transforms.json"
+    meta = json.loads(file.read_text())
+    for frame in meta["frames"]:
+        frame["transform_matrix"][0][3] += 50
+    file.write_text(json.dumps(meta))
+    config = semantic_trainer(capture).config.pipeline
+    config.datamanager.dataparser.state = state
+    told = ["--worlds similar" in note for note in config.setup(device="cpu").notes]
+    assert any(told) == (state == 1)
+
+
 def test_depth_that_contradicts_itself_is_told_and_not_used(depth_capture_dir, semantic_trainer, tmp_path):
     capture = shutil.copytree(depth_capture_dir, tmp_path / "capture")
     file = capture / "state_00/transforms.json"
