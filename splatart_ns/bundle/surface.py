@@ -18,6 +18,7 @@ from splatart_ns.errors import InputError
 from splatart_ns.geometry.camera import project_points
 from splatart_ns.geometry.se3 import matrix_from_quat, transform_points
 from splatart_ns.rasterize import rasterization
+from splatart_ns.rasterize.render import PIXEL_VARIANCE
 from splatart_ns.splats.splat import Splat
 
 _MIN_OPACITY = 0.02
@@ -212,6 +213,7 @@ def _look(splat: Splat, direction: Tensor, pixels: int) -> _DepthView:
         *(splat.means, splat.quats, splat.scales, splat.opacities),
         torch.cat([_base_colours(splat), (planes[:, :, None] * F.one_hot(layer, _SLICES)[:, None]).flatten(1)], 1),
         *(viewmat[None], K[None], pixels, pixels),
+        eps2d=PIXEL_VARIANCE,
     )
     weight, at_centre, along_x, along_y = image[0, ..., 3:].unflatten(-1, (4, _SLICES)).unbind(-2)
     from_centre = torch.arange(pixels)[:, None] + 0.5 - pixels / 2
@@ -241,7 +243,7 @@ def _depth_planes(splat: Splat, viewmat: Tensor, K: Tensor) -> Tensor:
     half = J @ viewmat[:3, :3] @ matrix_from_quat(splat.quats) * splat.scales[:, None]
     covariance = half @ half.mT
     # The rasterizer's own blur, without which the slopes of Gaussians seen on edge have no bound.
-    seen = covariance[:, :2, :2] + 0.3 * torch.eye(2)
+    seen = covariance[:, :2, :2] + PIXEL_VARIANCE * torch.eye(2)
     slope = torch.linalg.solve(seen, covariance[:, :2, 2])
     return torch.cat([(z - _DISTANCE - (slope * offset).sum(-1))[:, None], slope], -1)
 

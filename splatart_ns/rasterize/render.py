@@ -11,6 +11,10 @@ from torch import Tensor
 from splatart_ns.rasterize.rasterization import Backend, rasterization, sh_colors
 from splatart_ns.splats.splat import Splat
 
+PIXEL_VARIANCE = 1 / 12
+"""By how much Gaussians are blurred in an image, pixels^2: as much as a square pixel blurs what it shows. The customary
+0.3 blurs edges over two pixels more than photographs do."""
+
 
 @dataclass
 class Rendering:
@@ -68,6 +72,7 @@ def render(
         Ks,
         width,
         height,
+        eps2d=PIXEL_VARIANCE,
         sh_degree=degree if features is None else None,
         render_mode="RGB+ED" if with_depth else "RGB",
         absgrad=absgrad,

@@ -15,6 +15,7 @@ from splatart_ns.capture.view import View, Window, box
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.geometry.similarity import inverse_similarity, view_of_moved
 from splatart_ns.rasterize.rasterization import rasterization, rasterize_neighbours, sh_colors
+from splatart_ns.rasterize.render import PIXEL_VARIANCE
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.light import even_light
 from splatart_ns.threads import side_by_side
@@ -50,11 +51,6 @@ class PartView:
     """Number of the part's own pixels at full size."""
     factor: int
 
-    @property
-    def eps2d(self) -> float:
-        """The blur of 0.3 pixels^2 of the full image, and what averaging its pixels adds."""
-        return 0.3 / self.factor**2 + (1 - 1 / self.factor**2) / 12
-
     def render(self, splat: Splat, T: Tensor, first_order: bool = False) -> Tensor:
         """The splat under motions or similarities [K, 4, 4]: [K, H, W, 4], colours over black and accumulation.
 
@@ -65,18 +61,18 @@ class PartView:
         gaussians = splat.means, splat.quats, splat.scales, splat.opacities
         colors = sh_colors(splat.means, splat.sh, viewmats, splat.sh_degree)
         if first_order:
-            return rasterize_neighbours(*gaussians, colors, viewmats, self.K, width, height, self.eps2d)
+            return rasterize_neighbours(*gaussians, colors, viewmats, self.K, width, height, PIXEL_VARIANCE)
         # Accumulation is what a channel shows that is one everywhere.
         channels = torch.cat([colors, torch.ones_like(colors[..., :1])], -1)
         Ks = self.K.expand(len(viewmats), 3, 3)
-        return rasterization(*gaussians, channels, viewmats, Ks, width, height, eps2d=self.eps2d)[0]
+        return rasterization(*gaussians, channels, viewmats, Ks, width, height, eps2d=PIXEL_VARIANCE)[0]
 
     def share(self, splat: Splat, chosen: Tensor) -> Tensor:
         """What the chosen Gaussians [N] bool of a splat make up of the view [H, W], 0..1."""
         height, width = self.weight.shape
         gaussians = splat.means, splat.quats, splat.scales, splat.opacities, chosen[:, None].to(splat.means)
         camera = self.viewmat[None], self.K[None], width, height
-        return rasterization(*gaussians, *camera, eps2d=self.eps2d)[0][0, ..., 0]
+        return rasterization(*gaussians, *camera, eps2d=PIXEL_VARIANCE)[0][0, ..., 0]
 
     def difference(
         self,

@@ -43,7 +43,7 @@ OTHERS = 2
 SUSPECT = 4.0
 """A motion that fits this many times worse than each state's own Gaussians is searched for once more, more widely.
 Right ones measured 1.0 to 2.5, but for parts of which one state hides most."""
-EXPLAINED = 2.0
+EXPLAINED = 1.8
 """Of such a part a motion that fits the images of one state at most this many times worse than that state's own
 Gaussians is preferred to what fits them as many times worse than it. Right ones measured 0.4 to 1.2 in one of the
 states (22 of 25), a wrong one 4."""

@@ -58,7 +58,7 @@ DIP = 10
 """Degrees about the best turn within which others may cost as little."""
 TOLD = 1.05
 """Beyond, they cost at least this many times the best where the images tell the turn: else it may be noise."""
-TOLD_AT_REST = 1.25
+TOLD_AT_REST = 1.3
 """At least this many times where they tell that it did not turn: a fork that hides the same of a wheel in both states
 tells that as well. Plain wheels of which much is hidden measured 1.08 to 1.15, a disc with a mark on its rim 1.4."""
 HARDLY_ROUND = 2.0

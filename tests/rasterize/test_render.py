@@ -3,6 +3,7 @@ import torch
 
 from splatart_ns.rasterize import render
 from splatart_ns.rasterize.rasterization import rasterization
+from splatart_ns.rasterize.render import PIXEL_VARIANCE
 from splatart_ns.splats.splat import Splat
 
 WIDTH, HEIGHT = 40, 30
@@ -35,10 +36,9 @@ def test_one_pass_equals_separate_ones():
     features = s.part_probabilities
     rendering = render(s, viewmats, Ks, WIDTH, HEIGHT, features=features, backend="torch")
     geometry = (s.means, s.quats, s.scales, s.opacities)
-    image, alpha, _ = rasterization(
-        *geometry, s.sh, viewmats, Ks, WIDTH, HEIGHT, sh_degree=2, render_mode="RGB+ED", backend="torch"
-    )
-    parts = rasterization(*geometry, features, viewmats, Ks, WIDTH, HEIGHT, backend="torch")[0]
+    camera = dict(viewmats=viewmats, Ks=Ks, width=WIDTH, height=HEIGHT, eps2d=PIXEL_VARIANCE, backend="torch")
+    image, alpha, _ = rasterization(*geometry, s.sh, sh_degree=2, render_mode="RGB+ED", **camera)
+    parts = rasterization(*geometry, features, **camera)[0]
     torch.testing.assert_close(rendering.rgb, image[..., :3])
     torch.testing.assert_close(rendering.depth, image[..., 3:])
     torch.testing.assert_close(rendering.accumulation, alpha)

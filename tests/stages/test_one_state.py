@@ -71,7 +71,7 @@ def test_the_shut_state_tells_that_a_drawer_slid_which_seems_turned_so_as_to_cov
     state, rivals = explained_by_one_state(*pairs, torch.stack([PULLED, COVERING]), ends, best)
     assert state == 0
     slid, _ = best_of(pairs[1].shown_by(0), rivals)
-    assert angle_deg(slid.T, PULLED) < 4
+    assert angle_deg(slid.T, PULLED) < 5
     assert torch.allclose(slid.T[:3, 3], PULLED[:3, 3], atol=0.06)
 
 
@@ -105,7 +105,7 @@ def test_a_state_that_shows_next_to_nothing_of_the_part_tells_nothing(pairs, end
 def test_a_pulled_drawer_is_found_by_what_the_shut_state_shows(scene, pairs):
     found = initial_motion(*scene, part=2)
     assert found.found and not found.still
-    assert angle_deg(found.T, PULLED) < 4
+    assert angle_deg(found.T, PULLED) < 5
     both = float(pairs[1].cost(found.T[None])[0])
     assert found.cost < 0.3 * both
     assert found.cost == pytest.approx(float(pairs[1].shown_by(0).cost(found.T[None])[0]), rel=0.5)

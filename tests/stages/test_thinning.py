@@ -44,7 +44,7 @@ def test_what_is_hidden_and_what_repeats_something_goes_first():
     splat = Splat.cat([cube, hidden, copies])
     absence, _ = absences(splat, photograph(splat), 0)
     of_cube, of_hidden, of_copies = absence.split([len(cube), len(hidden), len(copies)])
-    assert of_hidden.max() < 0.1 * of_cube.median()
+    assert of_hidden.max() < 0.15 * of_cube.median()
     assert of_copies.median() < 0.2 * of_cube.median()
 
 

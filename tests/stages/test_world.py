@@ -53,7 +53,7 @@ def test_haze_at_one_edge_makes_no_world_larger(monkeypatch):
         clean[1].select(torch.arange(len(row))),
         means=torch.stack([torch.full_like(row, 0.58), row, torch.full_like(row, -0.3)], -1),
         log_scales=torch.full((len(row), 3), math.log(0.05)),
-        opacity_logits=torch.full((len(row),), 0.0),
+        opacity_logits=torch.full((len(row),), 1.0),
     )
     splats = clean[0], Splat.cat([clean[1], haze])
     seen = tuple(visibility(s, v) for s, v in zip(splats, views, strict=True))

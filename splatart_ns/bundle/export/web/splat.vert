@@ -5,7 +5,7 @@ precision highp float;
 precision highp int;
 
 const int WIDTH_BITS = 12;  // of TEXTURE_WIDTH
-const float BLUR = 0.3;  // variance added to the projected covariance, pixel^2
+const float BLUR = 1.0 / 12.0;  // variance added to the projected covariance, pixel^2: that of a square pixel
 const float LEAST_ALPHA = 1.0 / 255.0;
 const float MARGIN = 0.15;  // of the image, beyond which the slope in the derivative is kept from growing
 const float OWN_COLOUR = 0.7;  // the share of a part's colour that does not depend on brightness
