@@ -11,6 +11,7 @@ import torch
 from splatart_ns.bundle.export import export, page, validate
 from splatart_ns.bundle.export.page_model import PageModel
 from splatart_ns.bundle.export.quantization import quantized, restored
+from splatart_ns.rasterize.render import PIXEL_VARIANCE
 
 KINDS = ("revolute", "prismatic", "screw", "cylindrical", "spherical", "free", "fixed")
 EVIL = '</script><img src=x onerror="alert(1)"><!--<script>{{scripts}}'
@@ -107,3 +108,9 @@ def test_needles_and_points_keep_their_size_where_it_can_be_seen(objects):
     column = page.page_object(bundle)["parts"][0]["columns"]["log_scales"]
     sizes = np.exp(restored(column)[0])
     assert sizes[:2] == pytest.approx([math.exp(-1), math.exp(-4)], rel=0.02) and sizes[2] < 1e-3
+
+
+def test_the_page_blurs_gaussians_as_the_rasterizer_does(objects, write):
+    path, _ = write(objects.chain(["revolute"]))
+    over, under = re.search(r"BLUR = ([\d.]+) / ([\d.]+);", path.read_text(encoding="utf-8")).groups()
+    assert float(over) / float(under) == pytest.approx(PIXEL_VARIANCE)
