@@ -60,8 +60,8 @@ TOLD = 1.05
 """Beyond, they cost at least this many times the best where the images tell the turn: else it may be noise."""
 TOLD_AT_REST = 1.3
 """At least this many times where they tell that it did not turn: a fork that hides the same of a wheel in both states
-tells that as well. Plain wheels of which much is hidden measured 1.08 to 1.15, a disc beneath a fork 1.29, one with a
-mark on its rim more than 1.4."""
+tells that as well. Plain wheels of which much is hidden measured 1.08 to 1.15, a disc with a mark on its rim 1.4 (by
+images blurred more, by which a disc beneath a fork measured 1.22, and 1.29 now)."""
 HARDLY_ROUND = 2.0
 """And this many times, by turns of `DIP` and a step, where half a turn shows that a part is not round, but silhouettes
 are blind to its turn. Wheels that are half hidden or lit from one side, knobs and a turntable that turned measured 1.0
