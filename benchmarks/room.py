@@ -31,7 +31,7 @@ from splatart_ns.capture.light import Light
 from splatart_ns.capture.procedural import write_object
 from splatart_ns.capture.ray_caster import RayCaster
 from splatart_ns.capture.robot import read_urdf
-from splatart_ns.capture.scene import Scene, camera_poses, ground_truth
+from splatart_ns.capture.scene import Scene, camera_poses, ground_truth, part_surfaces
 from splatart_ns.capture.surface import Surface, join
 from splatart_ns.capture.synthesis import POINTS_PER_PART
 from splatart_ns.capture.textures import paint
@@ -94,7 +94,7 @@ def write_room(name: str, folder: Path, frames: int) -> None:
     ground_truth.json."""
     with tempfile.TemporaryDirectory() as temporary:
         robot = read_urdf(write_object(name, Path(temporary)))
-        scene = Scene.of(robot, {}, [robot.complete(values) for values in OBJECTS[name]])
+        scene = Scene.of(robot, {}, part_surfaces(robot, {}), [robot.complete(values) for values in OBJECTS[name]])
     distance = scene.camera_distance(_FIELD)
     for k, values in enumerate(scene.configurations):
         _write_state(folder, scene, values, distance, frames, k)

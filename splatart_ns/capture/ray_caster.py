@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from splatart_ns.capture.images import undistorted_points
 from splatart_ns.capture.light import Light
 from splatart_ns.capture.surface import Surface, join
 from splatart_ns.errors import InputError
+
+if TYPE_CHECKING:
+    from embreex.rtcore_scene import EmbreeScene
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,22 @@ class Rendering:
         return self.part_ids > 0
 
 
+def embree_scene(triangles: np.ndarray) -> EmbreeScene:
+    """Triangles [G, 3, 3] as what rays meet, in float32.
+
+    Raises:
+        InputError: embreex is not installed.
+    """
+    try:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+    except ImportError as error:
+        raise InputError("Ray casting needs embreex; install it with `pip install embreex`.") from error
+    scene = EmbreeScene()
+    TriangleMesh(scene, triangles.astype(np.float32))
+    return scene
+
+
 class RayCaster:
     """Parts at rest in one configuration.
 
@@ -42,20 +62,13 @@ class RayCaster:
     """
 
     def __init__(self, parts: Mapping[int, Surface]) -> None:
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ImportError as error:
-            raise InputError("Ray casting needs embreex; install it with `pip install embreex`.") from error
-
         self._surface = join(list(parts.values()))
         self._part = np.repeat(np.array(list(parts), dtype=np.uint8), [len(s.sides) for s in parts.values()])
         triangles = self._surface.triangles
         low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
         # Rays are float32: about the object's centre they lose least.
         self._centre, self._size = 0.5 * (low + high), float(np.linalg.norm(high - low))
-        self._scene = EmbreeScene()
-        TriangleMesh(self._scene, (triangles - self._centre).astype(np.float32))
+        self._scene = embree_scene(triangles - self._centre)
         self._atlas = _Atlas(self._surface)
 
     def render(self, camera: Camera, T_world_camera: np.ndarray, light: Light, samples: int = 2) -> Rendering:

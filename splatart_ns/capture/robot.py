@@ -109,6 +109,10 @@ class Robot:
                 break
         return out
 
+    def halfway(self, first: Mapping[str, float], second: Mapping[str, float]) -> dict[str, float]:
+        """The values of all movable joints in the middle between two configurations."""
+        return self.complete({name: 0.5 * (first[name] + second[name]) for name in first})
+
     def link_poses(self, values: Mapping[str, float]) -> dict[str, np.ndarray]:
         """T_world_link [4, 4] of every link; the world is the root link's frame."""
         values = self.complete(values)
@@ -138,6 +142,20 @@ class Robot:
             shaped = [link for link in links if self.links[link]]
             parts.append(Part((shaped or links)[0], tuple(links), bool(shaped)))
         return tuple(parts)
+
+    def hinges(self, frozen: Mapping[str, float] | None = None) -> dict[str, tuple[str | None, tuple[Joint, ...]]]:
+        """Each part that has a shape to the next above it that has one, None where none has, and the joints between."""
+        parts = self.parts(frozen)
+        part_of = {link: part for part in parts for link in part.links}
+        above = {part_of[j.child].name: j for j in self.joints if part_of[j.child] is not part_of[j.parent]}
+        out = {}
+        for part in (p for p in parts if p.has_geometry):
+            parent, joints = part, []
+            while parent.name in above and (parent is part or not parent.has_geometry):
+                joints.append(above[parent.name])
+                parent = part_of[joints[-1].parent]
+            out[part.name] = parent.name if joints and parent.has_geometry else None, tuple(joints)
+        return out
 
     def surface(self, part: Part, values: Mapping[str, float]) -> Surface | None:
         """A part's surface in its own frame, None where no link of it has a shape. `values` place frozen joints."""

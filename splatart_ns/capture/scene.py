@@ -36,28 +36,28 @@ class Scene:
     """Of the sphere about the centre that holds all states."""
 
     @staticmethod
-    def of(robot: Robot, frozen: dict[str, float], configurations: list[dict[str, float]]) -> Scene:
+    def of(
+        robot: Robot,
+        frozen: dict[str, float],
+        surfaces: Mapping[str, Surface],
+        configurations: list[dict[str, float]],
+    ) -> Scene:
+        """`surfaces` are those of `part_surfaces`."""
         parts = robot.parts(frozen)
-        shaped = [p for p in parts if p.has_geometry]
-        if not shaped:
-            raise InputError(f"{robot.path}: no link has a <visual>; there is nothing to render.")
-        if len(shaped) > 254:
-            raise InputError(f"{robot.path}: has {len(shaped)} parts; labels have room for 254, freeze some joints.")
-        ids = {p.name: i for i, p in enumerate(shaped, start=1)}
-        surfaces = {ids[p.name]: robot.surface(p, configurations[0]) for p in shaped}
-        first, second = configurations[:2]
-        novel = robot.complete({name: 0.5 * (first[name] + second[name]) for name in first})
+        ids = {name: i for i, name in enumerate(surfaces, start=1)}
+        novel = robot.halfway(*configurations[:2])
 
         points = []
         for values in (*configurations, novel):
             poses = robot.link_poses(values)
-            for part in shaped:
-                T, corners = poses[part.frame_link], surfaces[ids[part.name]].triangles.reshape(-1, 3)
+            for part in (p for p in parts if p.name in ids):
+                T, corners = poses[part.frame_link], surfaces[part.name].triangles.reshape(-1, 3)
                 points.append(corners @ T[:3, :3].T + T[:3, 3])
         points = np.concatenate(points)
         centre = np.round(0.5 * (points.min(axis=0) + points.max(axis=0)), 9)
         radius = float(np.linalg.norm(points - centre, axis=-1).max())
-        return Scene(robot, frozen, parts, ids, surfaces, configurations, novel, centre, radius)
+        by_id = {ids[name]: surface for name, surface in surfaces.items()}
+        return Scene(robot, frozen, parts, ids, by_id, configurations, novel, centre, radius)
 
     def part_poses(self, values: Mapping[str, float]) -> dict[str, np.ndarray]:
         """T_world_part [4, 4] by part name."""
@@ -72,6 +72,20 @@ class Scene:
     def camera_distance(self, fov_degrees: float) -> float:
         """From the centre to a camera that sees all of the bounding sphere."""
         return _MARGIN * self.radius / math.sin(math.radians(0.5 * fov_degrees))
+
+
+def part_surfaces(robot: Robot, frozen: Mapping[str, float]) -> dict[str, Surface]:
+    """Part name to its surface in its own frame, of the parts that have a shape.
+
+    Raises:
+        InputError: there is none, or more than labels have room for; a mesh that cannot be read.
+    """
+    shaped = [part for part in robot.parts(frozen) if part.has_geometry]
+    if not shaped:
+        raise InputError(f"{robot.path}: no link has a <visual>; there is nothing to render.")
+    if len(shaped) > 254:
+        raise InputError(f"{robot.path}: has {len(shaped)} parts; labels have room for 254, freeze some joints.")
+    return {part.name: robot.surface(part, frozen) for part in shaped}
 
 
 def camera_poses(count: int, centre: np.ndarray, distance: float, views: str, rng: np.random.Generator) -> np.ndarray:

@@ -13,16 +13,16 @@ import trimesh
 
 from splatart_ns.capture.capture import Camera
 from splatart_ns.capture.images import depth_unit, write_depth, write_png
+from splatart_ns.capture.joint_draws import draw_configurations
 from splatart_ns.capture.ray_caster import RayCaster
-from splatart_ns.capture.robot import Joint, Robot, read_urdf
-from splatart_ns.capture.scene import Scene, camera_poses, ground_truth
+from splatart_ns.capture.robot import Robot, read_urdf
+from splatart_ns.capture.scene import Scene, camera_poses, ground_truth, part_surfaces
+from splatart_ns.capture.surface import Surface
 from splatart_ns.capture.synthesis_options import MOST_PIXELS, SynthesisOptions
 from splatart_ns.errors import InputError
 from splatart_ns.files import new_folder
 
 POINTS_PER_PART = 10_000
-_TURN = 1.75
-"""Radian: joints that turn further than this are moved within a window of it, so that states have views in common."""
 
 
 def synthesize(urdf: Path, output_dir: Path, options: SynthesisOptions | None = None) -> Path:
@@ -47,12 +47,12 @@ def synthesize(urdf: Path, output_dir: Path, options: SynthesisOptions | None = 
     _check(options)
     robot = read_urdf(Path(urdf))
     frozen = _frozen(robot, options)
-    configurations = _configurations(robot, frozen, options)
-    scene = Scene.of(robot, frozen, configurations)
+    surfaces = part_surfaces(robot, frozen)
+    scene = Scene.of(robot, frozen, surfaces, _configurations(robot, frozen, surfaces, options))
     with new_folder(output_dir) as folder:
-        for k, values in enumerate(configurations):
+        for k, values in enumerate(scene.configurations):
             _write_state(folder / f"state_{k:02d}", scene, values, options, options.train_views, k)
-        _write_state(folder / "eval" / "novel_00", scene, scene.novel, options, 0, len(configurations))
+        _write_state(folder / "eval" / "novel_00", scene, scene.novel, options, 0, len(scene.configurations))
         _write_points(folder / "ground_truth_points", scene, options.seed)
         truth = ground_truth(scene, options.fov_degrees, options.resolution, options.length_unit, POINTS_PER_PART)
         text = json.dumps(truth, indent=1)
@@ -133,29 +133,13 @@ def _unfrozen(text: str, robot: Robot, frozen: Mapping[str, float]) -> dict[str,
     return values
 
 
-def _configurations(robot: Robot, frozen: Mapping[str, float], options: SynthesisOptions) -> list[dict[str, float]]:
+def _configurations(
+    robot: Robot, frozen: Mapping[str, float], surfaces: Mapping[str, Surface], options: SynthesisOptions
+) -> list[dict[str, float]]:
     """The values of all movable joints, for each state."""
     if options.joint_values:
         return [robot.complete({**_unfrozen(text, robot, frozen), **frozen}) for text in options.joint_values]
-    free = [j for j in robot.movable if j.name not in frozen and j.mimic is None]
-    rng = np.random.default_rng([options.seed, 0])
-    columns = {j.name: _spread_values(j, robot, options.states, rng) for j in free}
-    return [
-        robot.complete({**{name: float(v[k]) for name, v in columns.items()}, **frozen}) for k in range(options.states)
-    ]
-
-
-def _spread_values(joint: Joint, robot: Robot, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Values within the limits, one in the middle of each of `count` equal ranges, shuffled: each state moves it."""
-    turns = joint.type != "prismatic"
-    if joint.limits is None and not turns:
-        raise InputError(f"{robot.path}: joint {joint.name!r} has no limits; add a <limit>, or give joint values.")
-    low, high = joint.limits or (-math.pi, math.pi)
-    if turns and high - low > _TURN:
-        middle = rng.uniform(low + 0.5 * _TURN, high - 0.5 * _TURN)
-        low, high = middle - 0.5 * _TURN, middle + 0.5 * _TURN
-    places = (rng.permutation(count) + rng.uniform(0.3, 0.7, count)) / count
-    return np.round(low + (high - low) * places, 4).clip(low, high)
+    return draw_configurations(robot, frozen, surfaces, options.states, options.seed)
 
 
 def _write_state(
