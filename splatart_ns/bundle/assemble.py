@@ -72,9 +72,14 @@ def _joint(joint: articulate.Joint, names: Mapping[int, str], in_tree: bool) -> 
         in_tree=in_tree,
         residual=fit.residual,
         covariance=fit.covariance,
-        ambiguous=fit.ambiguous,
-        alternatives=fit.alternatives,
+        ambiguous=fit.ambiguous or joint.other is not None,
+        alternatives=fit.alternatives + ([] if joint.other is None else [_other_parent(joint.other, names)]),
     )
+
+
+def _other_parent(joint: articulate.Joint, names: Mapping[int, str]) -> dict[str, Any]:
+    fit = joint.fit
+    return {"type": fit.type, "residual": fit.residual, "score": fit.score, "parent": names[joint.parent]}
 
 
 def _loop(tree: KinematicTree, joint: articulate.Joint, names: Mapping[int, str]) -> dict[str, Any]:

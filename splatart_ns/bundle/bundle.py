@@ -58,7 +58,8 @@ class Joint:
     [S D, S D]; None where undetermined."""
     ambiguous: bool = False
     alternatives: list[dict[str, Any]] = field(default_factory=list)
-    """Other types that were tried: {"type", "residual", "score"}."""
+    """Other types that were tried: {"type", "residual", "score"}; and, with the key "parent", the joint by which the
+    child would hang on another part, where that is nearly as likely."""
 
     @property
     def ranges(self) -> list[tuple[float, float]]:

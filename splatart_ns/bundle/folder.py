@@ -201,10 +201,7 @@ def _read_joint(record: Record, num_states: int, parts: list[str]) -> Joint:
     residual = record.number("residual")
     if residual < 0:
         record.fail("residual", f"is {residual}", "a distance is 0 or more")
-    alternatives = [
-        {"type": r.choice("type", list(JOINT_DOFS)), "residual": r.number("residual"), "score": r.number("score")}
-        for r in record.records("alternatives")
-    ]
+    alternatives = [_read_alternative(r, parts) for r in record.records("alternatives")]
     return Joint(
         name=record.text("name"),
         type=kind,
@@ -221,6 +218,15 @@ def _read_joint(record: Record, num_states: int, parts: list[str]) -> Joint:
         ambiguous=record.flag("ambiguous"),
         alternatives=alternatives,
     )
+
+
+def _read_alternative(record: Record, parts: list[str]) -> dict[str, Any]:
+    return {
+        "type": record.choice("type", list(JOINT_DOFS)),
+        "residual": record.number("residual"),
+        "score": record.number("score"),
+        **({"parent": record.choice("parent", parts)} if "parent" in record.fields else {}),
+    }
 
 
 def _read_covariance(record: Record, num_values: int) -> dict[str, Any]:

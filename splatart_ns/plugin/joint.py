@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -254,6 +255,7 @@ class JointPipeline(VanillaPipeline):
         )
         self.tree = doubted(self.tree, state["_model.alike"])
         self.notes = [f"{capture.parts[part]}: {reason}" for part, reason in self.tree.unattached.items()]
+        self.notes += [other_parent_note(j, capture.parts) for j in self.tree.joints if j.other is not None]
         for note in self.notes:
             CONSOLE.log(note, markup=False)
         if not all(bool(states.all()) for states in known.values()):
@@ -288,6 +290,15 @@ def doubted(tree: KinematicTree, alike: Tensor) -> KinematicTree:
         replace(j.fit, ambiguous=j.fit.ambiguous or bool(alike[[j.parent - 1, j.child - 1]].any())) for j in tree.joints
     ]
     return replace(tree, joints=[replace(j, fit=fit) for j, fit in zip(tree.joints, fits, strict=True)])
+
+
+def other_parent_note(joint: Joint, names: Mapping[int, str]) -> str:
+    """Of a joint whose child may hang on another part."""
+    child, parent, other = names[joint.child], names[joint.parent], names[joint.other.parent]
+    return (
+        f"{child} hangs on {parent}, but may as well hang on {other}: --joint '{child}:{other}' says so, "
+        f"--joint '{child}:{parent}' that it does not."
+    )
 
 
 def surface_points(splat: Splat) -> Tensor:

@@ -23,6 +23,8 @@ class Joint:
     """How far the two parts come apart in the observed states, length."""
     cost: float = 0.0
     """What speaks against the joint, in shares of the object's radius."""
+    other: Joint | None = None
+    """By which the child would hang on another parent, where that is nearly as likely."""
 
     @property
     def name(self) -> str:

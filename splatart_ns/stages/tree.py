@@ -61,6 +61,10 @@ _ONE_LINE = 0.1
 _TURNED_BACK = 0.1
 """And besides, of such a hinge, where its parent turned further on the root than the child, which then turned back on
 it: of a stapler's three parts about one pin, that in the middle turned by less than the last."""
+_CLOSE_CALL = 0.02
+"""How much more the cheapest tree may cost that hangs a part on another one, where that is said to be as likely.
+Measured on 387 joints of robots, models and random objects: so it is of 10 of 20 that have a wrong parent, all but two
+of which have their true one in that other tree, and of 14 of the 367 others."""
 _IN_TOUCH = 0.1
 """Largest gap of two parts of a group that only a free joint carries, as a share of the object's radius."""
 
@@ -133,8 +137,8 @@ def infer_tree(
     reached = set(points) - set(tree.unattached) - {base for _, base in groups}
     reasons = {base: _why_unattached(base, reached, joints, radius) for _, base in groups}
     tree = replace(tree, unattached=tree.unattached | reasons)
-    if method == "descent":
-        return tree
+    if method == "descent":  # its fits have no scores
+        return replace(tree, joints=[replace(j, other=None) for j in tree.joints])
     errors, weights = {}, {}
     places, motions, known = place_unseen(tree, motions, known)
     points = {p: transform_points(places[p].to(x), x) for p, x in points.items()}
@@ -195,6 +199,8 @@ def build_tree(
         joint = min(open_edges, key=lambda j: j.cost)
         chosen.append(joint)
         reached.add(joint.child)
+    others = _other_parents(allowed, parents, root)
+    chosen = [replace(j, other=graph[others[j.child], j.child]) if j.child in others else j for j in chosen]
 
     tree = KinematicTree(list(part_ids), root, chosen)
     taken = {_pair(j.parent, j.child) for j in chosen}
@@ -210,6 +216,17 @@ def build_tree(
     rejected = [j for j in rest if j not in loops]
     unattached = {p: _why_unattached(p, reached, joints, object_radius) for p in part_ids if p not in reached}
     return replace(tree, loops=loops, rejected=rejected, unattached=unattached)
+
+
+def _other_parents(costs: Mapping[tuple[int, int], float], parents: Mapping[int, int], root: int) -> dict[int, int]:
+    """By child: its parent in the cheapest tree that hangs it on another one, where that tree costs hardly more."""
+    least, others = sum(costs[a, b] for b, a in parents.items()), {}
+    for b, a in parents.items():
+        elsewhere = cheapest_parents({edge: cost for edge, cost in costs.items() if edge != (a, b)}, root)
+        cost = sum(costs[parent, child] for child, parent in elsewhere.items())
+        if elsewhere.keys() == parents.keys() and cost - least < _CLOSE_CALL:
+            others[b] = elsewhere[b]
+    return others
 
 
 def _free_groups(

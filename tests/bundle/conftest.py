@@ -33,7 +33,10 @@ def make_bundle() -> Bundle:
         limits=(0.0, math.pi / 2),
         residual=1e-3,
         covariance={"values": [[0.1, 0.0], [0.0, 0.1]], "origin": None},
-        alternatives=[{"type": "screw", "residual": 9e-4, "score": 1.5}],
+        alternatives=[
+            {"type": "screw", "residual": 9e-4, "score": 1.5},
+            {"type": "revolute", "residual": 2e-3, "score": 9.0, "parent": "latch"},
+        ],
     )
     slide = Joint(
         name="slide",

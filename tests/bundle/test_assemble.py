@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -23,7 +24,10 @@ def assembled(bundle):
     tree = KinematicTree(
         [1, 2, 3, 4],
         root=1,
-        joints=[Joint(1, 2, fit("revolute", Z, 0.5)), Joint(2, 3, fit("prismatic", X, 0.2))],
+        joints=[
+            Joint(1, 2, fit("revolute", Z, 0.5)),
+            Joint(2, 3, fit("prismatic", X, 0.2), other=Joint(1, 3, replace(fit("revolute", Z, 0.2), score=7.0))),
+        ],
         loops=[Joint(1, 3, fit("revolute", Z, 0.1))],
         unattached={4: "No joint explains how part 4 moves."},
     )
@@ -46,6 +50,13 @@ def test_parts_on_the_tree_move_as_their_joints_say(assembled):
 
 def test_a_part_that_hangs_on_nothing_keeps_its_own_motion(assembled):
     assert assembled.part("cat").motion[1, 0, 3] == 7.0
+
+
+def test_a_part_that_may_hang_on_another_has_an_ambiguous_joint_and_names_it(assembled):
+    door, knob = assembled.tree_joints
+    assert not door.ambiguous and door.alternatives == []
+    assert knob.ambiguous
+    assert knob.alternatives == [{"type": "revolute", "residual": 1e-3, "score": 7.0, "parent": "body"}]
 
 
 def test_loops_name_the_parts_around_them(assembled):

@@ -64,6 +64,8 @@ def test_part_names_that_are_no_file_names_stay_inside_and_apart(bundle, tmp_pat
         for joint in bundle.joints:
             joint.parent = name if joint.parent == part.name else joint.parent
             joint.child = name if joint.child == part.name else joint.child
+            for other in joint.alternatives:
+                other.update({"parent": name} if other.get("parent") == part.name else {})
         part.name = name
     bundle.root = "../../a"
     bundle.loops = []
@@ -147,6 +149,7 @@ PART, JOINT = ("parts", 1), ("joints", 1)
         (set_(*JOINT, "covariance", "values", value=[[1.0]]), "values"),
         (set_(*JOINT, "covariance", "pitch", value=None), "pitch"),
         (set_(*JOINT, "alternatives", 0, "type", value="x"), "alternatives"),
+        (set_(*JOINT, "alternatives", 1, "parent", value="nobody"), "known are base"),
         (set_("loops", 0, "joint", value="hinge"), "known are closure"),
         (set_("loops", 0, "parts", value=["base", "nobody"]), "nobody"),
         (set_("provenance", value=3), "provenance"),

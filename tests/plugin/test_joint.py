@@ -18,6 +18,7 @@ from splatart_ns.plugin.joint import (
     JointModelConfig,
     JointPipeline,
     covariances_to_world,
+    other_parent_note,
     splat_to_world,
     surface_points,
 )
@@ -222,6 +223,12 @@ def test_joints_of_a_part_that_may_have_turned_otherwise_are_ambiguous(tmp_path:
     state = pose_state() | {"_model.alike": torch.tensor([False, True])}
     (joint,) = joint_pipeline(tmp_path, capture_dir, state).bundle.joints
     assert joint.ambiguous
+
+
+def test_of_a_part_that_may_hang_on_another_the_report_tells_how_to_decide() -> None:
+    fit = JointFit("revolute", HINGE, HINGE, 0.0, torch.zeros(2), residual=0.0)
+    note = other_parent_note(Joint(1, 3, fit, other=Joint(2, 3, fit)), {1: "base", 2: "lid", 3: "knob"})
+    assert note.startswith("knob hangs on base, but may as well hang on lid: --joint 'knob:lid' says so")
 
 
 def test_an_unfinished_or_foreign_pose_run_is_refused(tmp_path: Path, capture_dir: Path) -> None:

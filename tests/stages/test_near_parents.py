@@ -12,15 +12,19 @@ from splatart_ns.stages.tree import build_tree
 X, Y, Z = torch.eye(3, dtype=torch.float64)
 
 
-def parents_found(joints: dict, gaps: dict, touching: torch.Tensor | None = None) -> dict[int, int]:
-    """By child, of parts 2 and 3 with these joints and gaps, one way round, on the root 1 and each other.
+def tree_found(joints: dict, gaps: dict, touching: torch.Tensor | None = None, required: dict | None = None):
+    """Of parts 2 and 3 with these joints and gaps, one way round, on the root 1 and each other.
 
-    `touching`: points [N, 3] that all parts have; by default the origin.
+    `touching`: points [N, 3] that all parts have; by default the origin. `required`: parents by child.
     """
     touching = torch.zeros(2, 3).double() if touching is None else touching
     contacts = {pair: Contact(gap, touching, (touching, touching)) for pair, gap in gaps.items()}
     joints = joints | {(b, a): fit for (a, b), fit in joints.items()}
-    return {j.child: j.parent for j in build_tree([1, 2, 3], joints, contacts, 1, 1.0).joints}
+    return build_tree([1, 2, 3], joints, contacts, 1, 1.0, required)
+
+
+def parents_found(*args) -> dict[int, int]:
+    return {j.child: j.parent for j in tree_found(*args).joints}
 
 
 @pytest.mark.parametrize(
@@ -118,3 +122,47 @@ def test_of_two_doors_that_turned_by_one_angle_none_slides_on_the_other(axis, cl
     on_both = torch.stack([0 * Z, 0.3 * Z])
     gaps = {(1, 2): 0.02, (1, 3): 0.16, (2, 3): 0.16 - closer}
     assert parents_found(joints, gaps, on_both) == {2: 1, 3: parent}
+
+
+def links(gaps):
+    """Three links about parallel lines, 2 on the root 1, and 3 on either, by their gaps."""
+
+    def turn(value, y):
+        return JointFit("revolute", X, y * Y, 0.0, torch.tensor([0.0, value]).double(), residual=0.0)
+
+    joints = {(1, 2): turn(0.2, 0.0), (1, 3): turn(0.5, 0.4), (2, 3): turn(0.3, 0.2)}
+    return joints, dict(zip(((1, 2), (1, 3), (2, 3)), gaps, strict=True)), torch.stack([0 * Y, 0.2 * Y, 0.4 * Y])
+
+
+def other_parents(tree):
+    return {j.child: None if j.other is None else j.other.parent for j in tree.joints}
+
+
+@pytest.mark.parametrize(
+    "gaps, parent, others",
+    [
+        ((0.01, 0.2, 0.175), 2, {2: None, 3: 1}),
+        ((0.01, 0.2, 0.185), 1, {2: None, 3: 2}),
+        ((0.01, 0.2, 0.15), 2, {2: None, 3: None}),
+        ((0.01, 0.2, 0.21), 1, {2: None, 3: None}),
+        ((0.17, 0.18, 0.01), 2, {2: 3, 3: 1}),
+    ],
+    ids=["hardly", "hardly the root", "clearly", "clearly the root", "either of two that hang together"],
+)
+def test_a_part_that_may_as_well_hang_on_another_is_said_to(gaps, parent, others):
+    tree = tree_found(*links(gaps))
+    assert {j.child: j.parent for j in tree.joints} == {2: 1, 3: parent}
+    assert other_parents(tree) == others
+    for joint in tree.joints:
+        assert joint.other is None or joint.other.child == joint.child
+
+
+def test_where_the_user_says_the_parent_no_other_is_as_likely():
+    assert other_parents(tree_found(*links((0.01, 0.2, 0.175)), {3: 2})) == {2: None, 3: None}
+    assert other_parents(tree_found(*links((0.01, 0.2, 0.175)), {3: 1})) == {2: None, 3: None}
+
+
+def test_a_part_that_only_one_parent_explains_has_no_other():
+    joints, gaps, touching = links((0.01, 0.2, 0.2))
+    del joints[1, 3]
+    assert other_parents(tree_found(joints, gaps, touching)) == {2: None, 3: None}
