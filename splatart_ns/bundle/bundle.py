@@ -62,6 +62,11 @@ class Joint:
     child would hang on another part, where that is nearly as likely."""
 
     @property
+    def other_parents(self) -> list[str]:
+        """Parts that the child may hang on as well."""
+        return [other["parent"] for other in self.alternatives if "parent" in other]
+
+    @property
     def ranges(self) -> list[tuple[float, float]]:
         """Of each of the joint's numbers: what its values, limits and 0, where state 0 is, lie between."""
         numbers = self.values.reshape(len(self.values), -1)

@@ -107,8 +107,10 @@ def tree_text(bundle: Bundle) -> str:
 
 
 def describe_joint(joint: Joint) -> str:
-    """Type, parent, and how certain the axis is."""
-    text = f"{joint.type} on {joint.parent}"
+    """Type, parent, and how certain they and the axis are."""
+    text = " or ".join([f"{joint.type} on {joint.parent}", *joint.other_parents])
+    if joint.ambiguous:
+        text += ", ambiguous"
     deviation = direction_deviation(joint)
     return text if deviation is None else f"{text}, axis ± {math.degrees(deviation):.2g} degree"
 

@@ -62,6 +62,10 @@ def test_a_name_cannot_become_code_of_the_page(bundle):
 def test_a_joint_says_how_certain_its_axis_is(bundle):
     hinge, runner = bundle.joints
     assert describe_joint(hinge) == "revolute on base, axis ± 0.57 degree"
+    hinge.ambiguous = True
+    assert describe_joint(hinge) == "revolute on base, ambiguous, axis ± 0.57 degree"
+    hinge.alternatives.append({"type": "revolute", "residual": 0.0, "score": 0.0, "parent": "latch"})
+    assert describe_joint(hinge) == "revolute on base or latch, ambiguous, axis ± 0.57 degree"
     assert describe_joint(runner) == "prismatic on base"
 
 

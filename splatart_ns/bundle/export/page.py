@@ -136,6 +136,7 @@ def _joint(joint: Joint, bundle: Bundle, radius: float) -> dict[str, Any]:
         },
         "length_unit": unit_name(False, bundle.length_unit),
         "ambiguous": joint.ambiguous,
+        "other_parents": [bundle.part_names.index(name) for name in joint.other_parents],
         "line": _line(joint, bundle.part(joint.child).splat.means.double().numpy(), radius),
     }
 

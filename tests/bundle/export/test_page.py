@@ -82,9 +82,14 @@ def test_what_is_uncertain_or_undetermined_is_told(objects):
         "origin": None,
     }
     joint.ambiguous = True
+    joint.alternatives = [
+        {"type": "fixed", "residual": 0.1, "score": 9.0},
+        {"type": "revolute", "residual": 0.0, "score": 1.0, "parent": "p2"},
+    ]
     about = page.page_object(bundle)["joints"][0]
     assert about["deviations"]["direction"] == pytest.approx(0.01) and about["deviations"]["place"] is None
     assert about["deviations"]["values"] == pytest.approx([0.02]) and about["ambiguous"]
+    assert about["other_parents"] == [2]
     along = np.array(about["line"]["points"]) @ joint.axis.numpy()
     distances = np.abs(along - joint.origin.numpy() @ joint.axis.numpy())
     np.testing.assert_allclose(about["line"]["deviations"], 0.01 * distances, atol=1e-12)

@@ -13,7 +13,7 @@ function fillTable(object) {
             element("td", {}, child.name),
             element("td", {}, hasAxis(joint) ? joint.axis.map(x => withMinus(x.toFixed(3))).join(", ") : "–"),
             element("td", {}, observed(joint)),
-            element("td", {className: joint.ambiguous ? "warning" : ""}, joint.ambiguous ? "yes" : "no"),
+            element("td", {className: joint.ambiguous ? "warning" : ""}, joint.ambiguous ? doubt(joint, object) : "no"),
             element("td", {}, uncertainty(joint)));
     });
     get("joints").append(...rows);
@@ -22,6 +22,10 @@ function fillTable(object) {
 
 function hasAxis(joint) {
     return ["revolute", "prismatic", "screw", "cylindrical"].includes(joint.type);
+}
+
+function doubt(joint, object) {
+    return ["yes", ...joint.other_parents.map(part => `may hang on ${object.parts[part].name}`)].join(", ");
 }
 
 /** What was observed, for each freedom. */
