@@ -46,9 +46,9 @@ def turned_as_neighbours_let(
     """
     motions = dict(motions)
     parts = _Parts.of(splats, [p for p, motion in motions.items() if motion.found])
-    T = {p: motions[p].T for p in parts.near}
-    sure = {p for p in parts.near if not motions[p].alike and not parts.turns_over(p, T)}
-    rest = {p: T[p] for p in parts.near if motions[p].still}
+    alone = {p: motions[p].T for p in parts.near if not motions[p].alike}
+    sure = {p for p in alone if not parts.turns_over(p, alone)}
+    rest = {p: T for p, T in alone.items() if motions[p].still}
     settled = sure | rest.keys()
     waiting = parts.near.keys() - settled
     while reached := {p: parts.near[p] & settled for p in waiting if parts.near[p] & settled}:

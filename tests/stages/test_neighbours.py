@@ -133,3 +133,22 @@ def test_a_part_is_judged_against_what_it_touches_and_that_first():
     assert torch.equal(found[2].T, first) and torch.equal(found[3].T, second)
     alone = {2: motions[2], 3: InitialMotion(second, found=False)}
     assert turned_as_neighbours_let(states, ([], []), alone) == alone
+
+
+def test_a_part_that_is_not_in_doubt_stays_so_beside_one_that_is():
+    """An elbow further from the shoulder than from the forearm, that looks alike turned over against it."""
+    places = {1: 0.0, 2: 0.5, 3: 1.2, 4: 1.7}
+    parts = {part: box(part, (0.5, 0.2, 0.2), (x, 0.0, 0.0), num_parts=4) for part, x in places.items()}
+    elbow = about(motion((0, 0, 60), (0, 0, 0)), torch.tensor([1.0, 0.1, 0.0]).double())
+    forearm = elbow @ about(motion((0, 0, 50), (0, 0, 0)), torch.tensor([1.45, 0.1, 0.0]).double())
+    over = forearm @ about(motion((180, 0, 0), (0, 0, 0)), torch.tensor([1.7, 0.0, 0.0]).double())
+    moved = {1: parts[1], 2: parts[2], 3: parts[3].transformed(elbow), 4: parts[4].transformed(forearm)}
+    motions = {
+        1: RESTS,
+        2: RESTS,
+        3: InitialMotion(elbow, found=True),
+        4: InitialMotion(over, found=True, alike=(forearm,)),
+    }
+    states = Splat.cat(list(parts.values())), Splat.cat(list(moved.values()))
+    found = turned_as_neighbours_let(states, ([], []), motions)
+    assert torch.equal(found[3].T, elbow) and torch.equal(found[4].T, forearm)
