@@ -103,15 +103,33 @@ def test_an_arm_of_seven_turns_and_two_slides_from_two_noisy_states(seed):
 
 def test_two_states_leave_a_planar_chain_to_contact():
     """With parallel axes any two links move like a joint; only touch tells which are neighbours."""
-    points = {k: rod((k, 0, 0), (k + 1, 0, 0), 0.1, k) for k in range(1, 5)}
-    truth = KinematicTree([1, 2, 3, 4], 1, [true_joint(k, k + 1, "revolute", Z, (k + 1, 0, 0)) for k in (1, 2, 3)])
-    q = torch.tensor([[0, 0, 0], [0.4, 0.5, 0.3]], dtype=torch.float64)
+    points = {k: rod((k, 0, 0), (k + 1, 0, 0), 0.1, k) for k in range(1, 7)}
+    joints = [true_joint(k, k + 1, "revolute", Z, (k + 1, 0, 0)) for k in range(1, 6)]
+    truth = KinematicTree(sorted(points), 1, joints)
+    q = torch.tensor([[0, 0, 0, 0, 0], [0.4, 0.5, 0.3, 0.2, 0.3]], dtype=torch.float64)
     motions = motions_of(truth, q)
     fits = fit_pairs(points, motions, object_radius(points))
     assert all(f.residual < 1e-9 and f.type == "revolute" for f in fits.values())
-    tree = infer_tree(points, motions)
+    tree = infer_tree(points, motions, root=1)
     assert edges(tree) == edges(truth) and not tree.loops
-    assert len(tree.rejected) == 3
+    assert {(1, 3), (2, 4)} <= {(j.parent, j.child) for j in tree.rejected}
+    assert not {(1, 6), (1, 5)} & {(j.parent, j.child) for j in tree.rejected}  # too far apart
+
+
+def test_parts_far_apart_are_joined_by_the_user_alone():
+    """A seat that turns and slides on its column moves as about a hinge of a castor that rolled as far as it slid."""
+    points = {
+        1: box((0, 0, 0), (0.4, 0.4, 0.4), 1),
+        2: box((0.3, 0, 0), (0.2, 0.2, 0.2), 2),
+        3: box((-1.2, 0, 0), (0.3, 0.3, 0.3), 3),
+    }
+    seat = true_joint(2, 3, "revolute", Z, (-1.2, 0, 0))
+    truth = KinematicTree([1, 2, 3], 1, [true_joint(1, 2, "prismatic", Z, (0, 0, 0)), seat])
+    motions = motions_of(truth, torch.tensor([[0, 0], [0.2, 0.7]], dtype=torch.float64))
+    assert fit_pairs(points, motions, object_radius(points))[2, 3].accepted
+    tree = infer_tree(points, motions, root=1)
+    assert edges(tree) == {(1, 2)} and "No joint explains how part 3 moves" in tree.unattached[3]
+    assert edges(infer_tree(points, motions, root=1, constraints=[JointConstraint(2, 3)])) == edges(truth)
 
 
 def drawers(states):
