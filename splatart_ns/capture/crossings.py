@@ -17,7 +17,8 @@ class Crossings:
 
     Links overlap about their joints, and much that touches in a drawing crosses by rounding, so that neither tells that
     a configuration cannot be. Surfaces cross where an edge of the one goes through a triangle of the other; meshes need
-    not be closed.
+    not be closed. (The depth of `interpenetration` takes solids that are convex and made to clear each other at their
+    joints, as objects made by code are.)
 
     Args:
         frozen: values of joints that are held.

@@ -143,7 +143,7 @@ class Robot:
             parts.append(Part((shaped or links)[0], tuple(links), bool(shaped)))
         return tuple(parts)
 
-    def hinges(self, frozen: Mapping[str, float] | None = None) -> dict[str, tuple[str | None, tuple[Joint, ...]]]:
+    def hinges(self, frozen: Mapping[str, float]) -> dict[str, tuple[str | None, tuple[Joint, ...]]]:
         """Each part that has a shape to the next above it that has one, None where none has, and the joints between."""
         parts = self.parts(frozen)
         part_of = {link: part for part in parts for link in part.links}

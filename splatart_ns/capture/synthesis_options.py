@@ -20,7 +20,8 @@ class SynthesisOptions:
     states: int = 2
     """How many configurations, when no joint values are given."""
     joint_values: tuple[str, ...] = ()
-    """One "joint=value,joint=value" per state (radian, length); without it, values are drawn within the limits."""
+    """One "joint=value,joint=value" per state (radian, length); without it, values are drawn within the limits, and
+    again where parts reach into each other."""
     freeze: tuple[str, ...] = ()
     """"joint=value" for joints that are held there in all states; their links become one part."""
     train_views: int = 40

@@ -136,7 +136,7 @@ def infer_tree(
     joints = {edge: fit for edge, fit in joints.items() if edge not in blind}
     contacts = find_contacts(points, motions, {_pair(*edge) for edge, fit in joints.items() if fit.accepted}, known)
     far = {pair for pair, contact in contacts.items() if contact.gap > _APART * radius}
-    far -= {_pair(c.parent, c.child) for c in constraints}
+    far -= {_pair(c.parent, c.child) for c in constraints if not c.forbidden}
     joints = {edge: fit for edge, fit in joints.items() if _pair(*edge) not in far}
     groups = _free_groups(points, motions, joints, contacts, root, radius, required)
     contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups}, known)

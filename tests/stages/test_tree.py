@@ -130,6 +130,8 @@ def test_parts_far_apart_are_joined_by_the_user_alone():
     tree = infer_tree(points, motions, root=1)
     assert edges(tree) == {(1, 2)} and "No joint explains how part 3 moves" in tree.unattached[3]
     assert edges(infer_tree(points, motions, root=1, constraints=[JointConstraint(2, 3)])) == edges(truth)
+    other = JointConstraint(2, 3, "prismatic", forbidden=True)
+    assert edges(infer_tree(points, motions, root=1, constraints=[other])) == {(1, 2)}
 
 
 def drawers(states):
