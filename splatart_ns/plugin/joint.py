@@ -252,6 +252,7 @@ class JointPipeline(VanillaPipeline):
             epsilon=config.epsilon,
             method=config.method,
             constraints=parse_constraints(config.joints, capture.parts, root),
+            names=capture.parts,
         )
         self.tree = doubted(self.tree, state["_model.alike"])
         self.notes = [f"{capture.parts[part]}: {reason}" for part, reason in self.tree.unattached.items()]

@@ -171,6 +171,8 @@ def _choose(
     if render_ratio is not None and best.type != "fixed":
         slides = render_ratio < PRISMATIC_BELOW
         allowed = [f for f in fits if f.type != "fixed" and (f.type == "prismatic") == slides]
+        if rotation_sigma > UNSEEN_ROTATION:  # light alone may tell such turns apart: it overrules no other motion
+            allowed = [f for f in allowed if f.accepted]
         best = min(allowed, key=lambda f: f.score, default=best)
     others = sorted((f for f in fits if f is not best), key=lambda f: f.score)
     unknown_turn = best.type == "prismatic" and rotation_sigma > _UNKNOWN_ROTATION

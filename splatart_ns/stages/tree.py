@@ -14,7 +14,7 @@ the group, so that the joints within it are not lost.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -92,6 +92,7 @@ def infer_tree(
     epsilon: float = EPSILON,
     method: JointMethod = "screw",
     constraints: Sequence[JointConstraint] = (),
+    names: Mapping[int, str] | None = None,
 ) -> KinematicTree:
     """Joints and tree from the parts' points [N, 3] at state 0 and their motions [S, 4, 4], both by part id.
 
@@ -99,14 +100,15 @@ def infer_tree(
     origin. `render_ratios` by (parent, child) in either order; `noise` and `epsilon` as in `fit_joint`. `method`
     "screw" fits in closed form and refines, pairs first and then the whole tree; "descent" is the paper's gradient
     descent, which knows no covariances and no ratios, for comparison. `constraints`: what the user knows of joints;
-    where they name a type, the first method fits it.
+    where they name a type, the first method fits it. `names`: what reasons and errors call the parts.
 
     Raises:
         InputError: the constraints contradict each other or the root, or name a part without points.
     """
+    names = names or _numbered({*points, *(p for c in constraints for p in (c.parent, c.child))})
     if missing := {p for c in constraints for p in (c.parent, c.child)} - set(points):
-        raise InputError(f"--joint: part {min(missing)} has no Gaussians to hang; leave it out")
-    required = required_parents(constraints, root, {p: f"part {p}" for p in points})
+        raise InputError(f"--joint: {names[min(missing)]} has no Gaussians to hang; leave it out")
+    required = required_parents(constraints, root, names)
     radius = object_radius(points)
     known = known_states(motions, covariances)
     lost = {p for p in points if not known[p][0]}
@@ -140,9 +142,9 @@ def infer_tree(
     joints = {edge: fit for edge, fit in joints.items() if _pair(*edge) not in far}
     groups = _free_groups(points, motions, joints, contacts, root, radius, required)
     contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups}, known)
-    tree = build_tree(sorted(points), joints | groups, contacts, root, radius, required)
+    tree = build_tree(sorted(points), joints | groups, contacts, root, radius, required, names)
     reached = set(points) - set(tree.unattached) - {base for _, base in groups}
-    reasons = {base: _why_unattached(base, reached, joints, radius) for _, base in groups}
+    reasons = {base: _why_unattached(base, reached, joints, radius, names) for _, base in groups}
     tree = replace(tree, unattached=tree.unattached | reasons)
     if method == "descent":  # its fits have no scores
         return replace(tree, joints=[replace(j, other=None) for j in tree.joints])
@@ -185,13 +187,15 @@ def build_tree(
     root: int,
     object_radius: float,
     required: Mapping[int, int] | None = None,
+    names: Mapping[int, str] | None = None,
 ) -> KinematicTree:
     """The spanning tree of least total cost from `root` over the accepted joints.
 
     `joints` by (parent, child), both ways round; `contacts` of the accepted ones by (a, b), a < b; `required`: parents
-    by child that the tree must have.
+    by child that the tree must have; `names`: what the reasons of parts that hang on nothing call the parts.
     """
     required = required or {}
+    names = names or _numbered(part_ids)
     graph = {}
     for (parent, child), fit in joints.items():
         if fit.accepted:
@@ -221,7 +225,7 @@ def build_tree(
     rest.sort(key=lambda j: j.cost)
     loops = [j for j in rest if _closes_loop(tree, j, contacts[_pair(j.parent, j.child)], object_radius)]
     rejected = [j for j in rest if j not in loops]
-    unattached = {p: _why_unattached(p, reached, joints, object_radius) for p in part_ids if p not in reached}
+    unattached = {p: _why_unattached(p, reached, joints, object_radius, names) for p in part_ids if p not in reached}
     return replace(tree, loops=loops, rejected=rejected, unattached=unattached)
 
 
@@ -351,16 +355,24 @@ def _path(tree: KinematicTree, part: int) -> set[int]:
     return path
 
 
+def _numbered(part_ids: Iterable[int]) -> dict[int, str]:
+    return {p: f"part {p}" for p in part_ids}
+
+
 def _why_unattached(
-    part: int, reached: set[int], joints: Mapping[tuple[int, int], JointFit], object_radius: float
+    part: int,
+    reached: set[int],
+    joints: Mapping[tuple[int, int], JointFit],
+    object_radius: float,
+    names: Mapping[int, str],
 ) -> str:
     tried = [
         (fit.residual / object_radius, p, fit.type) for (p, c), fit in joints.items() if c == part and p in reached
     ]
     if not tried:
-        return f"Part {part} has no fitted joint to any part of the tree."
+        return f"No joint was fitted between {names[part]} and any part of the tree."
     residual, parent, kind = min(tried)
     return (
-        f"No joint explains how part {part} moves: the best, {kind} on part {parent}, leaves {residual:.1%} of the "
+        f"No joint explains how {names[part]} moves: the best, {kind} on {names[parent]}, leaves {residual:.1%} of the "
         "object's radius, more than the limit and than noise would."
     )

@@ -163,6 +163,23 @@ def test_rendering_decides_between_turn_and_slide_where_it_was_asked():
     assert fit_joint(still, scene.points, object_radius=1.0, render_ratio=9.0).type == "fixed"
 
 
+def test_rendering_makes_no_hinge_of_a_round_lid_that_slid():
+    """A lid's turn about its own axis shows by light alone: no reason to leave it without a joint."""
+    scene = Scene(8)
+    T = scene.motions("prismatic", [0.0, 0.1])
+    spin = torch.cat([torch.linalg.cross(scene.points.mean(0), scene.axis), scene.axis])
+    T = torch.stack([T[0], T[1] @ se3_exp(math.radians(5) * spin)])
+    unseen = {"covariance": 3 * spin.outer(spin).expand(2, 6, 6), "object_radius": 1.0, "noise": 0.001}
+    fit = fit_joint(T, scene.points, render_ratio=1.5, **unseen)
+    assert fit.type == "prismatic" and fit.accepted and scene.axis_error(fit) < 0.01
+    assert math.isclose(float(fit.values[1].abs()), 0.1, rel_tol=0.01)
+    tilted = scene.motions("revolute", [0.0, 0.5])
+    across = torch.linalg.svd(scene.axis[None], full_matrices=True).Vh[1]
+    spin = torch.cat([torch.linalg.cross(scene.points.mean(0), across), across])
+    unseen["covariance"] = 3 * spin.outer(spin).expand(2, 6, 6)
+    assert fit_joint(tilted, scene.points, render_ratio=1.5, **unseen).type == "revolute"
+
+
 def test_a_known_covariance_overrules_the_default_noise():
     """The same turn of 4 degrees: significant by default, not where the images leave it open."""
     scene = Scene(9)

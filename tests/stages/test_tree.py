@@ -127,8 +127,10 @@ def test_parts_far_apart_are_joined_by_the_user_alone():
     truth = KinematicTree([1, 2, 3], 1, [true_joint(1, 2, "prismatic", Z, (0, 0, 0)), seat])
     motions = motions_of(truth, torch.tensor([[0, 0], [0.2, 0.7]], dtype=torch.float64))
     assert fit_pairs(points, motions, object_radius(points))[2, 3].accepted
-    tree = infer_tree(points, motions, root=1)
-    assert edges(tree) == {(1, 2)} and "No joint explains how part 3 moves" in tree.unattached[3]
+    names = {1: "column", 2: "castor", 3: "seat"}
+    tree = infer_tree(points, motions, root=1, names=names)
+    assert edges(tree) == {(1, 2)} and tree.unattached[3].startswith("No joint explains how seat moves: the best, ")
+    assert any(f" on {name}, leaves" in tree.unattached[3] for name in ("column", "castor"))
     assert edges(infer_tree(points, motions, root=1, constraints=[JointConstraint(2, 3)])) == edges(truth)
     other = JointConstraint(2, 3, "prismatic", forbidden=True)
     assert edges(infer_tree(points, motions, root=1, constraints=[other])) == {(1, 2)}
@@ -389,6 +391,8 @@ def test_the_user_decides_what_hangs_on_what():
         infer_tree(points, motions, root=1, constraints=[JointConstraint(2, 1)])
     with pytest.raises(InputError, match="part 9"):
         infer_tree(points, motions, constraints=[JointConstraint(1, 9)])
+    with pytest.raises(InputError, match="--joint: handle has no Gaussians"):
+        infer_tree(points, motions, constraints=[JointConstraint(1, 9)], names={1: "body", 9: "handle"})
 
 
 @pytest.mark.parametrize("kind", ["fixed", "revolute", "screw", "cylindrical", "spherical", "free"])
