@@ -7,8 +7,8 @@ parent is not the root, and 1 for every degree of freedom beyond the first: two 
 like one joint of more freedom. With two states kinematics alone cannot find the tree: about as many false pairs as
 true ones move like joints, two drawers for instance. Contact tells them apart.
 
-A part that no joint explains hangs on nothing, and the tree says why. If other parts hang on it, a free joint carries
-the group, so that the joints within it are not lost.
+A part that no joint explains, not even one that turns and slides (`cylindrical`), hangs on nothing, and the tree says
+why. If other parts hang on it, a free joint carries the group, so that the joints within it are not lost.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from splatart_ns.geometry.se3 import inverse, transform_points
 from splatart_ns.stages.arborescence import cheapest_parents, reached_from
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.contact import Contact, find_contacts
+from splatart_ns.stages.cylindrical import turning_slides
 from splatart_ns.stages.joint import EPSILON, NOISE, fit_joint
 from splatart_ns.stages.joint_constraint import JointConstraint, required_parents
 from splatart_ns.stages.joint_fit import JointFit, free_joint
@@ -140,10 +141,17 @@ def infer_tree(
     far = {pair for pair, contact in contacts.items() if contact.gap > _APART * radius}
     far -= {_pair(c.parent, c.child) for c in constraints if not c.forbidden}
     joints = {edge: fit for edge, fit in joints.items() if _pair(*edge) not in far}
+    if method != "descent":
+        hung = reached_from([edge for edge, fit in joints.items() if fit.accepted], root)
+        told = {_pair(c.parent, c.child) for c in constraints if c.forbidden and c.type == "cylindrical"}
+        open_ = {edge: fit for edge, fit in joints.items() if _pair(*edge) not in told}
+        slides = turning_slides(points, motions, open_, hung, radius, known, **certainty)
+        joints |= slides
+        contacts |= find_contacts(points, motions, {_pair(*edge) for edge in slides}, known)
     groups = _free_groups(points, motions, joints, contacts, root, radius, required)
     contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups}, known)
     tree = build_tree(sorted(points), joints | groups, contacts, root, radius, required, names)
-    reached = set(points) - set(tree.unattached) - {base for _, base in groups}
+    reached = reached_from([(j.parent, j.child) for j in tree.joints if (j.parent, j.child) not in groups], root)
     reasons = {base: _why_unattached(base, reached, joints, radius, names) for _, base in groups}
     tree = replace(tree, unattached=tree.unattached | reasons)
     if method == "descent":  # its fits have no scores
@@ -337,8 +345,9 @@ def _closes_loop(tree: KinematicTree, joint: Joint, contact: Contact, object_rad
     if joint.fit.type == "prismatic" and len(joint.fit.values) == 2:
         return False
     # Configurations in which every joint goes its own way.
-    factors = torch.rand(4, len(tree.movable), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    q = (2 * factors - 1) * tree.observed().abs().amax(0).cpu()
+    reach = tree.observed().abs().amax(0).cpu()
+    factors = torch.rand(4, len(reach), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    q = (2 * factors - 1) * reach
     T = dict(zip(tree.part_ids, forward_kinematics(tree, q).unbind(1), strict=True))
     T_rel = torch.cat([torch.eye(4).to(q)[None], inverse(T[joint.parent]) @ T[joint.child]])
     free = fit_joint(T_rel, contact.points.cpu(), object_radius=object_radius, types=(joint.fit.type,))

@@ -340,6 +340,7 @@ def test_parts_that_hang_together_but_on_nothing_else_are_carried_by_a_free_join
     assert edges(tree) == {(1, 2), (1, 3), (1, base), (base, other)}
     assert {j.child: j.fit.type for j in tree.joints if j.child > 3} == {base: "free", other: "revolute"}
     assert f"No joint explains how part {base} moves" in tree.unattached[base]
+    assert f"on part {other}, leaves" not in tree.unattached[base]  # it hangs on the base itself
     assert tree.observed().shape == (4, 1 + 1 + 6 + 1)
     T = forward_kinematics(tree, tree.observed(), root_motion=motions[1])
     for k, part in enumerate(tree.part_ids):
