@@ -24,6 +24,7 @@ from splatart_ns.stages.render_choice import (
     DOUBTFUL_VIEWS,
     FINE_PIXELS,
     SLIDE_TURN,
+    TURNED_OVER,
     VIEWS,
     InitialMotion,
     appearance_cost,
@@ -39,11 +40,14 @@ SAME_WAY = 0.98
 
 
 def slide_ways(motions: Sequence[InitialMotion]) -> Tensor:
-    """Directions [K, 3] along which parts slid whose motions are not in doubt."""
+    """Directions [K, 3] along which parts slid whose motions are not in doubt, but for what looks alike turned over:
+    the plain fronts of a table's only two drawers do."""
     ways: list[Tensor] = []
     for motion in motions:
         turn, shift = so3_log(motion.T[:3, :3]).norm(), motion.T[:3, 3]
-        if not motion.found or motion.still or motion.alike or turn > math.radians(SLIDE_TURN) or not shift.any():
+        if not motion.found or motion.still or turn > math.radians(SLIDE_TURN) or not shift.any():
+            continue
+        if any(so3_log(other[:3, :3]).norm() < TURNED_OVER for other in motion.alike):
             continue
         way = shift / shift.norm()
         if all(abs(float(way @ other)) < SAME_WAY for other in ways):

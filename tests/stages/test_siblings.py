@@ -25,13 +25,13 @@ def doubtful(scene, T):
     return InitialMotion(T, found=True, cost=cost, identity_ratio=3.0, alike=(OVER,))
 
 
-def test_ways_are_of_sure_slides_and_each_is_told_once():
+def test_ways_are_of_slides_unless_another_motion_but_turned_over_looks_alike_and_each_is_told_once():
     ways = slide_ways(
         [
             slid(0.3, 0.0, 0.0),
             slid(-0.1, 0.005, 0.0),  # the same way back
-            slid(0.0, 0.0, 2.0),
-            slid(0.0, 0.4, 0.0, alike=(OVER,)),
+            slid(0.0, 0.0, 2.0, alike=(OVER,)),  # a plain drawer's front
+            slid(0.0, 0.4, 0.0, alike=(OVER, motion((0, 0, 40), (0.0, 0.3, 0.0)))),
             slid(0.0, 0.0, 0.0, still=True),
             InitialMotion(EYE, found=False),
             InitialMotion(motion((0, 0, 20), (0.0, 0.3, 0.0)), found=True),
