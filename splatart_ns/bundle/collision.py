@@ -20,6 +20,8 @@ _PIECES = 12
 """At most."""
 _VERTICES = 32
 """Of a piece, at most."""
+_FLAT = 1e-9
+"""A hull of no more volume than this share of the cube of its longest side lies in a plane but for rounding."""
 
 
 def convex_pieces(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
@@ -67,7 +69,8 @@ def _hull_of(points: np.ndarray) -> trimesh.Trimesh | None:
         hull = trimesh.convex.convex_hull(points)
     except Exception:  # Qhull's error has no public type of its own in scipy's older versions.
         return None
-    return hull if hull.is_volume else None
+    with np.errstate(divide="ignore", invalid="ignore"):  # trimesh divides by volumes of 0
+        return hull if hull.is_volume and hull.volume > _FLAT * hull.extents.max() ** 3 else None
 
 
 def _with_few_triangles(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from splatart_ns.bundle.collision import convex_pieces
+from splatart_ns.bundle.collision import _hull_of, convex_pieces
 
 
 def tray() -> trimesh.Trimesh:
@@ -65,3 +65,13 @@ def test_a_thin_rough_sheet_stays_whole():
     points = blade.sample(500, seed=0)
     outside = [np.maximum(-trimesh.proximity.signed_distance(piece, points), 0) for piece in convex_pieces(blade)]
     assert np.min(outside, axis=0).max() < 0.02
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("twice", [False, True], ids=["a volume by rounding", "a volume of 0"])
+def test_points_of_a_plane_but_for_rounding_have_no_hull(twice):
+    plane = [[1.222, 1.162, 1.502], [1.223, 1.343, 1.524], [1.185, 1.105, 1.464], [1.0210000000000001, 1.301, 1.348]]
+    plane += [[0.891, 1.011, 1.2040000000000002], [0.9650000000000001, 1.125, 1.28]]
+    if twice:
+        plane.insert(2, plane[0])
+    assert _hull_of(np.array(plane)) is None
