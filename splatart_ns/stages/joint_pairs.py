@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -69,9 +69,13 @@ def told_pair(
     points: dict[int, Tensor],
     motions: dict[int, Tensor],
     object_radius: float,
+    excluded: Collection[str] = (),
     **settings: Any,
 ) -> dict[tuple[int, int], JointFit]:
-    """The joints, both ways round, of a pair of parts as the user wants them; `settings` as in `fit_pairs`."""
+    """The joints, both ways round, of a pair of parts as the user wants them.
+
+    `excluded`: the types that other constraints rule out; `settings` as in `fit_pairs`.
+    """
     kind, pair = constraint.type, (constraint.parent, constraint.child)
     fits = {edge: joints[edge] for edge in (pair, pair[::-1]) if edge in joints}
     if constraint.forbidden:
@@ -79,7 +83,11 @@ def told_pair(
             return {}
         types = [t for t in types_for(len(motions[pair[0]])) if t != kind]
         return fit_pairs(points, motions, object_radius, types=types, **settings) if fits[pair].type == kind else fits
-    if kind == "free" or kind is None and not fits[pair].accepted:
+    if kind is None and not fits[pair].accepted:
+        # Of two states a turn about a line and a slide along it explain every motion.
+        two_states = len(motions[pair[0]]) == 2
+        kind = "cylindrical" if two_states and "cylindrical" not in excluded else "free"
+    if kind == "free":
         fits = {(a, b): free_joint(inverse(motions[a].double()) @ motions[b].double(), points[b]) for a, b in fits}
     elif kind is not None:
         fits = fit_pairs(points, motions, object_radius, types=[kind], **settings)

@@ -131,7 +131,8 @@ def infer_tree(
         joints = fit_pairs(points, motions, radius, render_ratios=render_ratios, **certainty)
     for c in sorted(constraints, key=lambda c: not c.forbidden):
         pair = {p: points[p] for p in (c.parent, c.child)}
-        told = told_pair(c, joints, pair, motions, radius, **certainty)
+        excluded = {d.type for d in constraints if d.forbidden and {d.parent, d.child} == set(pair)}
+        told = told_pair(c, joints, pair, motions, radius, excluded, **certainty)
         joints = {edge: fit for edge, fit in joints.items() if set(edge) != set(pair)} | told
     # A part of which nothing tells where it is at state 0 hangs on others, and nothing hangs on it.
     joints = {(a, b): fit for (a, b), fit in joints.items() if a not in lost}

@@ -54,15 +54,22 @@ def test_what_turns_and_slides_about_a_part_s_line_must_be_in_touch(height, hung
 
 
 @pytest.mark.parametrize("turn", [-math.pi / 2, math.pi / 2])
-def test_a_die_that_rolled_over_a_plate_does_not_hang_on_it(turn):
+def test_a_die_that_rolled_over_a_plate_hangs_on_it_only_if_told(turn):
     """It lies on the plate in both states, but turned about a line above it, or below."""
     points = {1: box((0, 0, -0.05), (1.6, 1.6, 0.1), 1), 2: box((0.3, 0.4, 0.1), (0.2, 0.2, 0.2), 2)}
     before, after = torch.tensor([[0.3, 0.4, 0.1], [-0.3, -0.4, 0.1]], dtype=torch.float64)
     R = so3_exp(torch.tensor([turn, 0, 0], dtype=torch.float64))
     rolled = from_rotation_translation(R, after - R @ before)
     still = torch.eye(4, dtype=torch.float64)
-    tree = infer_tree(points, {1: torch.stack([still, still]), 2: torch.stack([still, rolled])})
+    motions = {1: torch.stack([still, still]), 2: torch.stack([still, rolled])}
+    tree = infer_tree(points, motions)
     assert not tree.joints and tree.unattached
+    told = [JointConstraint(1, 2)]
+    (joint,) = infer_tree(points, motions, constraints=told).joints
+    assert joint.fit.type == "cylindrical" and joint.fit.residual < 1e-9
+    told.append(JointConstraint(1, 2, "cylindrical", forbidden=True))
+    (joint,) = infer_tree(points, motions, constraints=told).joints
+    assert joint.fit.type == "free"
 
 
 def test_the_user_may_rule_the_cylinder_out():
