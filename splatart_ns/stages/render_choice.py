@@ -248,7 +248,7 @@ def alike_in_even_light(
 def refined(coarse: PartPair, fine: PartPair, candidates: Tensor) -> list[Refinement]:
     """The motions [C, 4, 4] refined on many pixels, of several those that render best once refined on few.
 
-    If the best turns the part over, a mere shift to the same place comes last, for `prefer_slide`.
+    If the best turns the part over, `mere_shifts` come last, for `prefer_slide`.
     """
     if len(candidates) > 1:
         near = [refine(coarse, T, 5) for T in candidates]
@@ -257,8 +257,20 @@ def refined(coarse: PartPair, fine: PartPair, candidates: Tensor) -> list[Refine
         times = DOUBTFUL if half_turn else 1.5
         candidates = choose(coarse, torch.stack([end.T for end in near]), times, own=own_appearance(coarse))
     ends = [refine(fine, T, 10) for T in candidates]
-    best = min(ends, key=lambda end: end.cost)
-    return [*ends, shifted(fine, best.T)] if so3_log(best.T[:3, :3]).norm() > TURNED_OVER else ends
+    return [*ends, *mere_shifts(fine, ends)]
+
+
+def mere_shifts(pair: PartPair, ends: Sequence[Refinement]) -> list[Refinement]:
+    """If the best of some motions turns a part over: shifts to where that puts it, and to where the one does that turns
+    it least.
+
+    What is turned over comes to lie elsewhere: a tray that was pushed in, by half its width.
+    """
+    turns = [float(so3_log(end.T[:3, :3]).norm()) for end in ends]
+    best = min(range(len(ends)), key=lambda i: ends[i].cost)
+    if turns[best] <= TURNED_OVER:
+        return []
+    return [shifted(pair, ends[i].T) for i in dict.fromkeys((best, min(range(len(ends)), key=turns.__getitem__)))]
 
 
 def ranked(pair: PartPair, ends: Sequence[Refinement]) -> tuple[np.ndarray, np.ndarray, list[int]]:

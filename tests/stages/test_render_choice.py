@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -19,6 +21,7 @@ from splatart_ns.stages.render_choice import (
     choose,
     initial_motion,
     looks_alike,
+    mere_shifts,
     own_appearance,
     prefer_less_turn,
     prefer_slide,
@@ -292,3 +295,12 @@ def test_where_all_candidates_turn_the_part_over_a_mere_shift_is_tried():
     assert np.abs(T[order[0]] - slide.numpy()).max() < 0.01
     upright = refined(pair, pair, slide[None])
     assert len(upright) == 1
+    # Turned over, it may lie too far away for a shift from there.
+    astray = over.clone()
+    astray[:3, 3] += torch.tensor([1.2, -0.9, 0.8])
+    tilted = slide @ motion((12, 0, 0), (0, 0, 0))
+    ends = [replace(upright[0], T=T, cost=cost) for T, cost in ((tilted, 1.1), (astray, 1.0))]
+    lost, found = mere_shifts(pair, ends)
+    assert (found.T - slide).abs().max() < 0.01 < 0.5 < (lost.T - slide).abs().max()
+    assert mere_shifts(pair, [replace(ends[0], cost=0.9), ends[1]]) == []
+    assert len(mere_shifts(pair, ends[1:])) == 1
