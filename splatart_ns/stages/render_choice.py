@@ -55,6 +55,9 @@ SLIDE_TURN = 6.0
 """Degrees by which a slide may seem to turn."""
 TURNED_OVER = math.radians(90)
 """A motion that turns a part by more is doubted, and a slide that looks alike is preferred to it."""
+UPRIGHT = 1.05
+"""Where it fits as well as each state's own Gaussians do, and one that turns the part by less costs less than this many
+times as much, that is preferred."""
 HALF_TURN = math.radians(170)
 """What turns by more makes half a turn; to one that does, one that makes less is preferred while in doubt."""
 PITCHED, UNPITCHED = 0.1, 0.03
@@ -277,7 +280,9 @@ def ranked(pair: PartPair, ends: Sequence[Refinement]) -> tuple[np.ndarray, np.n
     """Motions [C, 4, 4], what they cost [C], and the distinct ones of them in the order in which they are preferred."""
     T = torch.stack([e.T for e in ends])
     cost, T = appearance_cost(pair, T), T.cpu().numpy()
-    order = prefer_slide(T, cost, distinct(T, cost, pair.centroid.cpu().numpy(), pair.radius))
+    order = distinct(T, cost, pair.centroid.cpu().numpy(), pair.radius)
+    upright = cost[order[0]] < STILL_RATIO * own_appearance(pair) and prefer_upright(T, cost, order)
+    order = upright or prefer_slide(T, cost, order)
     return T, cost, prefer_less_turn(T, cost, prefer_turn(T, cost, order, pair.radius))
 
 
@@ -319,6 +324,19 @@ def prefer_slide(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]
     if turn[order[0]] < TURNED_OVER or not slides:
         return order
     return [slides[0], *(i for i in order if i != slides[0])]
+
+
+def prefer_upright(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]:
+    """`order` of motions [C, 4, 4] by cost [C], with one first that turns the part less far than over and fits as well
+    as a best one by which it turns over; empty where there is none, or the best does not.
+
+    A knob looks alike turned over, but for its back, which no image shows.
+    """
+    turn = _angles(T)
+    upright = [i for i in order if turn[i] < TURNED_OVER and cost[i] < UPRIGHT * cost[order[0]]]
+    if turn[order[0]] < TURNED_OVER or not upright:
+        return []
+    return [upright[0], *(i for i in order if i != upright[0])]
 
 
 def prefer_turn(T: np.ndarray, cost: np.ndarray, order: list[int], radius: float) -> list[int]:

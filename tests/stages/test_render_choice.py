@@ -26,6 +26,7 @@ from splatart_ns.stages.render_choice import (
     prefer_less_turn,
     prefer_slide,
     prefer_turn,
+    prefer_upright,
     ranked,
     refined,
 )
@@ -225,6 +226,29 @@ def test_a_slide_that_fits_nearly_as_well_is_preferred_to_turning_over():
     assert prefer_slide(T, np.array([1.0, 1.05, 0.98 * ALIKE]), [0, 1, 2]) == [2, 0, 1]
     assert prefer_slide(T, np.array([1.0, 1.05, 1.3]), [0, 1, 2]) == [0, 1, 2]
     assert prefer_slide(T, np.array([1.1, 1.0, 1.15]), [1, 0, 2]) == [1, 0, 2]
+
+
+def test_a_knob_that_fits_as_well_turned_by_less_is_not_turned_over():
+    T = np.stack([motion(turn, (0, 0, 0)).numpy() for turn in ((0, 133, 0), (0, 0, 48), (0, 0, 0))])
+    assert prefer_upright(T, np.array([1.0, 1.02, 1.03]), [0, 1, 2]) == [1, 0, 2]
+    assert prefer_upright(T, np.array([1.0, 1.2, 1.3]), [0, 1, 2]) == []
+    assert prefer_upright(T, np.array([1.0, 0.99, 1.3]), [1, 0, 2]) == []
+
+
+def test_where_the_right_turn_fits_no_slide_that_fits_worse_stands_for_turning_over():
+    """A nearly symmetric knob: the images tell its turn, but hardly what lies behind it."""
+    turn = motion((0, 0, 50), (0.0, 0.0, 0.0))
+    splats, views = two_states(turn)
+    pair = part_pair(splats, views, 2, num_views=3, pixels=400)
+    still = refined(pair, pair, turn[None])[0]
+    over = turn @ motion((180, 0, 0), (0.0, 0.0, 0.0))
+    ends = [replace(still, T=T) for T in (over, turn, torch.eye(4, dtype=torch.float64))]
+    own = own_appearance(pair)
+    for times, first in ((1.0, 1), (2.0, 2)):
+        costs = iter([[times * own, 1.03 * times * own, 1.2 * times * own]])
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(render_choice, "appearance_cost", lambda *_, costs=costs: np.array(next(costs)))
+            assert ranked(pair, ends)[2][0] == first
 
 
 @pytest.mark.parametrize(
