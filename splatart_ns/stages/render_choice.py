@@ -273,7 +273,8 @@ def mere_shifts(pair: PartPair, ends: Sequence[Refinement]) -> list[Refinement]:
     best = min(range(len(ends)), key=lambda i: ends[i].cost)
     if turns[best] <= TURNED_OVER:
         return []
-    return [shifted(pair, ends[i].T) for i in dict.fromkeys((best, min(range(len(ends)), key=turns.__getitem__)))]
+    straightest = min(range(len(ends)), key=turns.__getitem__)
+    return [shifted(pair, ends[i].T) for i in dict.fromkeys((best, straightest))]
 
 
 def ranked(pair: PartPair, ends: Sequence[Refinement]) -> tuple[np.ndarray, np.ndarray, list[int]]:

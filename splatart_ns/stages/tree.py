@@ -144,9 +144,9 @@ def infer_tree(
     joints = {edge: fit for edge, fit in joints.items() if _pair(*edge) not in far}
     if method != "descent":
         hung = reached_from([edge for edge, fit in joints.items() if fit.accepted], root)
-        told = {_pair(c.parent, c.child) for c in constraints if c.forbidden and c.type == "cylindrical"}
-        open_ = {edge: fit for edge, fit in joints.items() if _pair(*edge) not in told}
-        slides = turning_slides(points, motions, open_, hung, radius, known, **certainty)
+        ruled_out = {_pair(c.parent, c.child) for c in constraints if c.forbidden and c.type == "cylindrical"}
+        allowed = {edge: fit for edge, fit in joints.items() if _pair(*edge) not in ruled_out}
+        slides = turning_slides(points, motions, allowed, hung, radius, known, **certainty)
         joints |= slides
         contacts |= find_contacts(points, motions, {_pair(*edge) for edge in slides}, known)
     groups = _free_groups(points, motions, joints, contacts, root, radius, required)
