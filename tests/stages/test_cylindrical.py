@@ -2,12 +2,12 @@ import math
 
 import pytest
 import torch
+from tree_scene import X, Z, box, edges, four_bar, motions_of, rod, true_joint
 
 from splatart_ns.geometry.se3 import from_rotation_translation, se3_exp, so3_exp
 from splatart_ns.stages.articulate import KinematicTree
 from splatart_ns.stages.joint_constraint import JointConstraint
 from splatart_ns.stages.tree import infer_tree
-from tests.stages.test_tree import X, Z, box, edges, four_bar, motions_of, rod, true_joint
 
 CHANGE = [0.07, 1.2, 0.4]
 
