@@ -20,6 +20,8 @@ STEPS, SIZE = 5, 256
 bundle, folder = map(Path, sys.argv[1:])
 folder.mkdir(parents=True, exist_ok=True)
 obj = load(bundle)
+if not obj.joints:
+    sys.exit(f"{bundle} has no joint that moves.")
 name, joint = next(iter(obj.joints.items()))
 first, last = joint.values.reshape(len(joint.values), -1)[[0, -1]]  # at the first and the last state
 values = torch.lerp(first, last, torch.linspace(0, 1, STEPS, dtype=torch.float64)[:, None])

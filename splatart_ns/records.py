@@ -39,6 +39,8 @@ class Record:
 
     def text(self, key: str) -> str:
         value = self._get(key, str, "a text that is not empty")
+        if any("\ud800" <= letter <= "\udfff" for letter in value):
+            self.fail(key, "holds half a character (a surrogate)", "write it again")
         return value or self.fail(key, "is empty", "give a text that is not empty")
 
     def integer(self, key: str) -> int:

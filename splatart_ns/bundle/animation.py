@@ -78,10 +78,11 @@ def write_frames(frames: Iterable[np.ndarray], path: Path, fps: float = 30.0) ->
     """Write frames [H, W, 3] RGB to `*.gif`, `*.mp4`, or as PNGs into a folder, which other paths are.
 
     Files appear under their names when they are whole. PNGs are `frame_0000.png` and so on; those of an earlier,
-    longer run are removed. Returns the number of frames.
+    longer run, which follow on these without a gap, are removed. Returns the number of frames.
 
     Raises:
-        InputError: `path` is called as other pictures or films are, or ffmpeg fails.
+        InputError: `path` is called as other pictures or films are, is a file where it should be a folder, or ffmpeg
+            fails.
     """
     path = Path(path)
     suffix = "" if path.is_dir() else path.suffix.lower()
@@ -91,6 +92,8 @@ def write_frames(frames: Iterable[np.ndarray], path: Path, fps: float = 30.0) ->
         return _write_mp4(frames, path, fps)
     if suffix in _OTHER_FORMATS:
         raise InputError(f"{path}: '{suffix}' cannot be written; give a .gif, an .mp4 or a folder")
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: is a file; give a .gif, an .mp4 or a folder")
     return _write_pngs(frames, path)
 
 
@@ -100,10 +103,10 @@ def _write_pngs(frames: Iterable[np.ndarray], folder: Path) -> int:
         with replacing(folder / _frame_name(count)) as temporary:
             Image.fromarray(frame).save(temporary)
         count += 1
-    for stale in folder.glob("frame_*.png"):
-        number = stale.stem.removeprefix("frame_")
-        if number.isdecimal() and int(number) >= count and stale.name == _frame_name(int(number)):
-            stale.unlink()
+    stale = count
+    while (folder / _frame_name(stale)).is_file():
+        (folder / _frame_name(stale)).unlink()
+        stale += 1
     return count
 
 
@@ -112,12 +115,19 @@ def _frame_name(number: int) -> str:
 
 
 def _write_gif(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
-    images = [Image.fromarray(frame).quantize() for frame in frames]
-    # Browsers take less than two hundredths of a second for ten; the count has 16 bits.
-    hundredths = round(min(max(100 / fps, 2), 65535))
+    # Browsers take less than two hundredths of a second for ten.
+    count, each, images, hundredths, last = 0, max(100 / fps, 2), [], [], None
+    for frame in frames:
+        if last is None or not np.array_equal(frame, last):
+            images.append(Image.fromarray(frame).quantize())
+            hundredths.append(0.0)
+        hundredths[-1] += each
+        last, count = frame, count + 1
+    # The count has 16 bits. Pillow would add up the times of frames that are alike, whatever that comes to.
+    durations = [10 * min(round(time), 65535) for time in hundredths]
     with replacing(path) as temporary:
-        images[0].save(temporary, save_all=True, append_images=images[1:], duration=10 * hundredths, loop=0)
-    return len(images)
+        images[0].save(temporary, save_all=True, append_images=images[1:], duration=durations, loop=0)
+    return count
 
 
 def _write_mp4(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
@@ -138,7 +148,7 @@ def _write_mp4(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
             if writer is not None:
                 writer.close()
         with _ffmpeg_at(path):  # which fails in silence, too
-            written, _ = imageio_ffmpeg.count_frames_and_secs(str(temporary))
+            written, _ = imageio_ffmpeg.count_frames_and_secs(str(temporary.absolute()))
             if written < count:
                 raise RuntimeError(f"{written} of {count} frames")
     return count
@@ -147,7 +157,8 @@ def _write_mp4(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
 def _film_writer(path: Path, frame: np.ndarray, fps: float) -> Generator[None, np.ndarray, None]:
     """Takes frames like this one."""
     size = frame.shape[1], frame.shape[0]
-    writer = imageio_ffmpeg.write_frames(str(path), size, fps=fps, quality=8, macro_block_size=2)
+    # A relative path with a colon would be a protocol's.
+    writer = imageio_ffmpeg.write_frames(str(path.absolute()), size, fps=fps, quality=8, macro_block_size=2)
     writer.send(None)
     return writer
 

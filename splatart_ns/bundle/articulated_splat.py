@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,6 +14,7 @@ from splatart_ns.bundle.bundle import Bundle, Joint
 from splatart_ns.bundle.camera import Camera, bounding_sphere
 from splatart_ns.bundle.configurations import movable_joints
 from splatart_ns.bundle.folder import load_bundle
+from splatart_ns.bundle.numbers import as_float64
 from splatart_ns.bundle.posing import (
     JointValue,
     configured_motions,
@@ -45,9 +47,19 @@ class Picture:
     ids: Tensor
     """The parts' label ids [P]."""
 
-    def over(self, background: Tensor) -> Tensor:
-        """Colours [B, H, W, 3] before a background [3] or an image [B, H, W, 3], clamped to 0..1."""
-        return (self.rgb + (1 - self.alpha[..., None]) * background.to(self.rgb)).clamp(0, 1)
+    def over(self, background: Tensor | np.ndarray | Sequence[float]) -> Tensor:
+        """Colours [B, H, W, 3] before a background [3] or an image [B, H, W, 3], clamped to 0..1.
+
+        Raises InputError for a background of another shape.
+        """
+        try:
+            behind = as_float64(background).to(self.rgb)
+            fits = torch.broadcast_shapes(behind.shape, self.rgb.shape) == self.rgb.shape and behind.shape[-1:] == (3,)
+        except (TypeError, ValueError, OverflowError, RuntimeError):
+            fits = False
+        if not fits:
+            raise InputError(f"the background is no colour [3] and no image {list(self.rgb.shape)}; give one of them")
+        return (self.rgb + (1 - self.alpha[..., None]) * behind).clamp(0, 1)
 
     @property
     def part_ids(self) -> Tensor:
@@ -55,6 +67,10 @@ class Picture:
         if self.part_shares is None:
             raise InputError("the picture has no part labels; render it with labels=True")
         return predicted_parts(self.alpha[..., None], self.part_shares, self.ids)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0].removesuffix(".")
 
 
 def predicted_parts(accumulation: Tensor, features: Tensor, ids: Tensor) -> Tensor:
@@ -76,9 +92,16 @@ class ArticulatedSplat:
     """
 
     def __init__(self, bundle: Bundle, device: torch.device | str | None = None):
-        """`device`: where images are made; by default CUDA, where there is any and the chosen rasterizer runs there."""
+        """`device`: where images are made; by default CUDA, where there is any and the chosen rasterizer runs there.
+
+        Raises InputError where there is no such device.
+        """
         self.bundle = bundle
-        self.device = torch.device(device or default_device())
+        try:
+            self.device = torch.device(device or default_device())
+            torch.empty(0, device=self.device)
+        except (RuntimeError, AssertionError, NotImplementedError) as error:
+            raise InputError(f"the device '{device}' cannot be used ({_first_line(error)}); give 'cpu'") from error
         parts = [replace(part, splat=part.splat.to(self.device)) for part in bundle.parts]
         self._on_device = replace(bundle, parts=parts)
         self._one_hot = part_features(bundle).to(self.device)
@@ -160,13 +183,14 @@ class ArticulatedSplat:
     def _shown(self, parts: Collection[str] | None) -> Tensor:
         """Which Gaussians [N] belong to these parts."""
         names = self.part_names
-        wanted = set(names if parts is None else parts)
+        wanted = {parts} if isinstance(parts, str) else set(names if parts is None else parts)
         if unknown := wanted - set(names):
             raise InputError(f"no part is called {', '.join(sorted(map(str, unknown)))}; there are {', '.join(names)}")
-        return self._one_hot @ torch.tensor([float(name in wanted) for name in names], device=self.device) > 0
+        return self._one_hot @ torch.tensor([name in wanted for name in names]).to(self._one_hot) > 0
 
     def _tensors(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        T = torch.from_numpy(self.normalization.camera_to_normal(camera.T_world_camera.numpy()))
+        T = camera.T_world_camera.clone()
+        T[..., :3, 3] = (T[..., :3, 3] - torch.from_numpy(self.centre)) / self.radius
         return viewmat_from_opengl(T).float().to(self.device), camera.K.float().to(self.device)
 
     def _picture(self, each: list[Rendering], batch: tuple[int, ...]) -> Picture:

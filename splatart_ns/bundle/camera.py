@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.bundle.bundle import Bundle
+from splatart_ns.bundle.numbers import as_float64
 from splatart_ns.bundle.posing import JointValue, configured_motions
 from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.images import undistorted_camera
@@ -20,6 +21,8 @@ from splatart_ns.geometry.se3 import transform_points
 _SAMPLES_PER_PART = 500
 _MIN_OPACITY = 0.1
 _FIELD_OF_VIEW = math.radians(35)
+_MOST_PIXELS = 1e9
+"""Focal lengths and centres reach no further."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +41,14 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            size = getattr(self, name)
+            if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
+                raise InputError(f"the camera's {name} is {size!r}; give a whole number of pixels, 1 or more")
+            object.__setattr__(self, name, int(size))
         T, K = _pose(self.T_world_camera), _intrinsics(self.K)
         if T.ndim == K.ndim == 3 and len(T) != len(K):
             raise InputError(f"the camera has {len(T)} T_world_camera but {len(K)} K; give as many, or one K")
-        for name in ("width", "height"):
-            if not isinstance(size := getattr(self, name), int) or size < 1:
-                raise InputError(f"the camera's {name} is {size!r}; give a whole number of pixels, 1 or more")
         object.__setattr__(self, "T_world_camera", T)
         object.__setattr__(self, "K", K)
 
@@ -63,7 +68,7 @@ def _pose(value: object) -> Tensor:
 
 
 def _intrinsics(value: object) -> Tensor:
-    if np.shape(value) == (4,):
+    if isinstance(value, list | tuple | np.ndarray | Tensor) and len(value) == 4:
         fx, fy, cx, cy = value
         value = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
     K = _matrices("K", value, 3)
@@ -72,13 +77,15 @@ def _intrinsics(value: object) -> Tensor:
     pinhole[..., 2, :] = K.new_tensor([0, 0, 1])
     if not torch.equal(K, pinhole) or not bool((K[..., [0, 1], [0, 1]] > 0).all()):
         raise InputError("the camera's K is no pinhole; give [fx 0 cx; 0 fy cy; 0 0 1] with fx and fy above 0")
+    if not bool((K.abs() < _MOST_PIXELS).all()):
+        raise InputError(f"the camera's K has a number of {float(K.abs().max()):g}; give pixels")
     return K
 
 
 def _matrices(name: str, value: object, size: int) -> Tensor:
     try:
-        tensor = torch.as_tensor(value, dtype=torch.float64).cpu()
-    except (TypeError, ValueError) as error:
+        tensor = as_float64(value)
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"the camera's {name} is {value!r}; give numbers") from error
     if tensor.ndim not in (2, 3) or tensor.shape[-2:] != (size, size):
         wanted = f"give [{size}, {size}] or [B, {size}, {size}]"
@@ -124,7 +131,12 @@ def front_azimuth(bundle: Bundle) -> float:
 def orbit_camera(
     centre: np.ndarray, radius: float, azimuth: float, elevation: float, width: int, height: int
 ) -> Camera:
-    """A camera that shows the whole sphere; azimuth from +x towards +y and elevation above the xy plane, radian."""
+    """A camera that shows the whole sphere; azimuth from +x towards +y and elevation above the xy plane, radian.
+
+    Raises InputError for a radius that is not above 0, and as `Camera` does.
+    """
+    if not 0 < radius < math.inf:
+        raise InputError(f"the radius is {radius}; give a number above 0")
     half = _FIELD_OF_VIEW / 2
     focal = min(width, height) / 2 / math.tan(half)
     back = np.array(

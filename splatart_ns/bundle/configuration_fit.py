@@ -37,7 +37,7 @@ class ConfigurationFit:
     residual: dict[str, float]
     """Mean Huber cost per own pixel of each moving part that is seen, as `PartPair.cost`."""
     unseen: list[str]
-    """Parts that no labelled view shows."""
+    """Parts that no labelled view shows, or that have no Gaussians."""
 
 
 @torch.no_grad()
@@ -54,7 +54,10 @@ def fit_configuration(bundle: Bundle, views: Sequence[View], normalization: Norm
         normalization: Of the views' capture.
     """
     splats = {part.name: normalized(part.splat, normalization) for part in bundle.parts}
-    coarse, fine = ({part.name: _looks(views, part.id, *size) for part in bundle.parts} for size in (_COARSE, _FINE))
+    coarse, fine = (
+        {part.name: _looks(views, part.id, *size) if len(part.splat) else [] for part in bundle.parts}
+        for size in (_COARSE, _FINE)
+    )
     joints = [joint for joint in bundle.tree_joints if JOINT_DOFS[joint.type] > 0]
     q = {joint.name: torch.zeros_like(joint.values[0]) for joint in joints}
     for joint in joints:
@@ -93,7 +96,7 @@ def appearance_residuals(
     """`ConfigurationFit.residual` of all parts that views show, where the parts' motions T[part] are known."""
     residuals = {}
     for part in bundle.parts:
-        if looks := _looks(views, part.id, *_FINE):
+        if len(part.splat) and (looks := _looks(views, part.id, *_FINE)):
             T = _to_normal(motions[part.name][None], normalization)
             residuals[part.name] = float(_cost(normalized(part.splat, normalization), looks, T)[0])
     return residuals

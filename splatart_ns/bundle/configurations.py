@@ -27,7 +27,7 @@ def parse_settings(settings: Sequence[str], bundle: Bundle) -> Configuration:
     """A configuration from texts `joint=value` or `part=value`; see `parse_value`. Values beyond limits are taken."""
     configuration: Configuration = {}
     for setting in settings:
-        name, equals, text = setting.partition("=")
+        name, equals, text = setting.rpartition("=")
         if not equals:
             raise InputError(f"--set: '{setting}' has no '='; write joint=value, for example door=30deg")
         joint = _find(name.strip(), bundle, "--set")
@@ -82,7 +82,8 @@ def sweep(bundle: Bundle, base: Mapping[str, float | list[float]], frames_per_jo
     """One movable joint after the other over what was observed, there and back, the others as in `base`.
 
     A joint of one freedom moves over its range like a cosine; it begins and ends at its value in `base` (0 where it has
-    none). One of several goes through its values at the states in turn, and back.
+    none), or at the end of its range next to that. One of several goes through its values at the states in turn, and
+    back.
     """
     configurations = []
     for name, joint in movable_joints(bundle).items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -22,6 +22,8 @@ Unreasonable Effectiveness of Quasirandom Sequences, 2018)."""
 _MOST_STATES, _SIZED_BY = 100_000, 256
 """Configurations that there may be; so many of them say how large the object is."""
 
+Views = Literal["sphere", "hemisphere"]
+
 
 @dataclass(frozen=True)
 class DatasetOptions:
@@ -31,7 +33,7 @@ class DatasetOptions:
     """How many configurations. Image i shows state i % states."""
     resolution: int = 256
     """Pixels along each side."""
-    views: Literal["sphere", "hemisphere"] = "sphere"
+    views: Views = "sphere"
     """See the object from everywhere, or from above (+z) only."""
     seed: int = 0
 
@@ -64,9 +66,14 @@ class Dataset:
         """Raises InputError for options that make no sense."""
         self.splat, self.options = splat, options or DatasetOptions()
         for name, least, most in (("states", 1, _MOST_STATES), ("resolution", 8, MOST_PIXELS), ("seed", 0, 2**128)):
-            if not least <= (value := getattr(self.options, name)) <= most:
+            value = getattr(self.options, name)
+            if isinstance(value, bool) or not isinstance(value, int):
+                raise InputError(f"--{name} is {value!r}; give a whole number")
+            if not least <= value <= most:
                 rule = f"{least} or more" if value < least else f"{most} or less"
                 raise InputError(f"--{name} is {value}; give {rule}")
+        if self.options.views not in get_args(Views):
+            raise InputError(f"--views is {self.options.views!r}; give {' or '.join(get_args(Views))}")
         some = [self.configuration(state) for state in range(min(self.options.states, _SIZED_BY))]
         self.centre, self.radius = bounding_sphere(splat.bundle, some)
         """Of a sphere about the object in all states, which every image shows whole."""

@@ -43,7 +43,7 @@ def write_dataset(
         Whether there is a ground truth.
 
     Raises:
-        InputError: a count below the number of states, or a folder that holds something else.
+        InputError: a count below the number of states, a folder that holds more images, or something else.
     """
     states = dataset.options.states
     if count > _MOST:
@@ -51,6 +51,8 @@ def write_dataset(
     if count < states:
         raise InputError(f"--dataset is {count}; give at least an image for each of the {states} --states")
     _claim(dataset, folder)
+    if (there := sum(1 for _ in folder.glob("state_*/images/[0-9]*.png"))) > count:
+        raise InputError(f"{folder}: holds {there} images, more than --dataset {count}; give another --output")
     unit = _depth_unit(dataset)
     for index in track([i for i in range(count) if not _image(folder, i, states).exists()]):
         _write_sample(dataset[index], folder, states, unit)
@@ -83,7 +85,8 @@ def _fingerprint(bundle: Bundle) -> str:
         digest.update(f"{part.id} {part.name}".encode())
         part.splat.map(lambda tensor: digest.update(tensor.cpu().numpy().tobytes()))
     for joint in bundle.tree_joints:
-        digest.update(json.dumps([joint.name, joint.type, joint.parent, joint.child, joint.pitch]).encode())
+        told = [joint.name, joint.type, joint.parent, joint.child, joint.pitch, joint.limits]
+        digest.update(json.dumps(told).encode())
         for tensor in (joint.axis, joint.origin, joint.values):
             digest.update(tensor.numpy().tobytes())
     return digest.hexdigest()
@@ -145,6 +148,7 @@ def ground_truth(dataset: Dataset) -> dict[str, Any]:
     poses = [configured_motions(bundle, q) for q in configurations]
     ids = {part.name: part.id for part in bundle.parts}
     index = {name: i for i, name in enumerate(ids)}
+    shaped = {part.name for part in bundle.parts if len(part.splat)}
 
     def joint_record(joint: Joint) -> dict[str, Any]:
         T = poses[0][joint.parent]
@@ -153,8 +157,8 @@ def ground_truth(dataset: Dataset) -> dict[str, Any]:
             "type": joint.type,
             "parent": joint.parent,
             "child": joint.child,
-            "parent_id": ids[joint.parent],
-            "child_id": ids[joint.child],
+            "parent_id": ids[joint.parent] if joint.parent in shaped else None,
+            "child_id": ids[joint.child] if joint.child in shaped else None,
             "parent_index": index[joint.parent],
             "child_index": index[joint.child],
             "axis": (T[:3, :3] @ joint.axis).tolist(),
@@ -176,8 +180,14 @@ def ground_truth(dataset: Dataset) -> dict[str, Any]:
         "world_frame": "canonical frame of the bundle",
         "segmentation": {"background": 0, "part_ids": {str(i): name for name, i in ids.items()}},
         "parts": [
-            {"index": index[name], "id": i, "name": name, "has_geometry": True, "root": name == bundle.root}
-            for name, i in ids.items()
+            {
+                "index": index[part.name],
+                "id": part.id,
+                "name": part.name,
+                "has_geometry": part.name in shaped,
+                "root": part.name == bundle.root,
+            }
+            for part in bundle.parts
         ],
         "joints": [joint_record(joint) for joint in bundle.tree_joints],
         "states": [
@@ -205,6 +215,8 @@ def ground_truth(dataset: Dataset) -> dict[str, Any]:
 def _write_points(dataset: Dataset, folder: Path) -> None:
     poses = dataset.splat.link_poses(dataset.configuration(0))
     for part in dataset.splat.bundle.parts:
+        if len(part.splat) == 0:
+            continue
         opacities = part.splat.opacities
         centres = part.splat.means[opacities >= min(_MIN_OPACITY, float(opacities.max()))].double()
         chosen = np.random.default_rng([dataset.options.seed, 2, part.id]).permutation(len(centres))[:_POINTS]

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
+from splatart_ns.bundle.numbers import as_float64
 from splatart_ns.capture.capture import Normalization
 from splatart_ns.errors import InputError
 from splatart_ns.splats.splat import Splat
@@ -26,8 +27,8 @@ def joint_motion(joint: Joint, value: JointValue) -> Tensor:
     On the CPU; differentiable in `value`. Raises InputError for values of the wrong shape, or not finite.
     """
     try:
-        value = torch.as_tensor(value, dtype=torch.float64).cpu()
-    except (TypeError, ValueError) as error:
+        value = as_float64(value)
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"joint '{joint.name}': {value!r} are no numbers; give radians or lengths") from error
     dofs = JOINT_DOFS[joint.type]
     if dofs > 1 and value.shape[-1:] != (dofs,):

@@ -11,6 +11,9 @@ import torch
 import torch.nn.functional as F
 import trimesh
 from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 from torch import Tensor
 
@@ -45,7 +48,7 @@ _LEFT_THICK = 0.25
 _COARSE = 4
 """Voxels between the places where the field is looked at far from any surface."""
 _MIN_COMPONENT = 0.01
-"""Components of less than this share of the largest one's area are floaters."""
+"""Components of less than this share of the largest one's area, or opacity, are floaters."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ def part_surface(
     if len(splat) == 0:
         raise InputError("a part has no visible Gaussians, and so no surface: fit the object again")
     clear = splat.opacities > _FAINT
-    splat = splat.select(clear) if clear.any() else splat
+    splat = without_strays(splat.select(clear) if clear.any() else splat)
     ends = _ellipsoid_ends(splat)
     centre, half = _box(ends)
     radius = float(half.norm())
@@ -135,6 +138,8 @@ def part_surface(
             break
         voxels //= 4
     mesh = _thinned(solid, (_THICKEN - _LEFT_THICK) * voxel)
+    if len(mesh.faces) == 0:
+        return _hull(splat, ends)
     colours, vertex_seen = _vertex_colours(views, torch.from_numpy(np.array(mesh.vertices)).float(), 2 * voxel)
     seen = vertex_seen[mesh.faces].any(1)
     if cameras is not None:
@@ -143,6 +148,24 @@ def part_surface(
     mesh.metadata["unseen_share"] = float(mesh.area_faces[~seen].sum() / mesh.area)
     mesh.vertices = mesh.vertices * radius + centre.numpy()
     return mesh
+
+
+def without_strays(splat: Splat) -> Splat:
+    """A splat without Gaussians far from all others: few, apart by as much as most lie from the middle.
+
+    One of them would make the part's box large and its voxels coarse.
+    """
+    x = splat.means.double()
+    middle = x.median(0).values
+    apart = float((x - middle).norm(dim=1).median())
+    if apart == 0:
+        return splat
+    cells, cell_of = np.unique(np.floor((x - middle).numpy() / apart), axis=0, return_inverse=True)
+    touching = cKDTree(cells).query_pairs(math.sqrt(3) + 1e-6, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(touching)), touching.T), (len(cells), len(cells)))
+    cluster = torch.from_numpy(connected_components(graph, directed=False)[1][cell_of.ravel()]).long()
+    weight = torch.zeros(int(cluster.max()) + 1).index_add(0, cluster, splat.opacities)
+    return splat.select((weight >= _MIN_COMPONENT * weight.max())[cluster])
 
 
 def _box(points: Tensor) -> tuple[Tensor, Tensor]:

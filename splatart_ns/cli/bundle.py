@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -84,11 +83,7 @@ class Export:
         from splatart_ns.bundle import export as exports
         from splatart_ns.bundle import load_bundle
 
-        for name, number in {"scale": self.scale, "density": self.density}.items():
-            if number is not None and not 0 < number < math.inf:
-                raise InputError(f"--{name} is {number}; give a number above 0.")
-        if not 0 <= self.limit_margin < math.inf:
-            raise InputError(f"--limit-margin is {self.limit_margin}; give a number of 0 or more.")
+        exports.check_numbers(self.scale, self.density, self.limit_margin)
         formats = tuple(dict.fromkeys(self.format))
         if not formats:
             raise InputError("--format is empty; give one or more of urdf, mjcf, usd, glb, ply, html.")

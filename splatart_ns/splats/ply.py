@@ -18,6 +18,10 @@ from splatart_ns.files import replacing
 from splatart_ns.splats.splat import Splat
 
 _MAX_HEADER_BYTES = 1 << 16
+_MOST_NORM = 1e12
+"""Of quaternions; beyond it, and below one over it, float32 cannot square them."""
+_MOST_LOG_SCALE = 40.0
+"""Larger Gaussians have variances that float32 cannot hold once they are rendered."""
 _SH_DEGREE_OF_REST = {0: 0, 9: 1, 24: 2, 45: 3}
 _CENTRE = ["x", "y", "z"]
 _COLOUR = ["f_dc_0", "f_dc_1", "f_dc_2"]
@@ -95,9 +99,15 @@ def read_ply(path: Path) -> Splat:
             dim=1,
         ),
     )
-    zero = (splat.quats == 0).all(-1).nonzero()
-    if len(zero):
-        raise InputError(f"{path}: the rotation of vertex {int(zero[0])} is 0 0 0 0; a quaternion must not be zero")
+    norm = splat.quats.double().norm(dim=-1)
+    if len(wrong := ((norm < 1 / _MOST_NORM) | (norm > _MOST_NORM)).nonzero()):
+        vertex = int(wrong[0])
+        given = " ".join(f"{x:g}" for x in splat.quats[vertex].tolist())
+        raise InputError(f"{path}: the rotation of vertex {vertex} is {given}; give a quaternion of about unit length")
+    if len(wrong := (splat.log_scales > _MOST_LOG_SCALE).nonzero()):
+        vertex, axis = wrong[0].tolist()
+        given = f"scale_{axis} of vertex {vertex} is {float(splat.log_scales[vertex, axis]):g}, a logarithm"
+        raise InputError(f"{path}: {given}; remove Gaussians larger than exp({_MOST_LOG_SCALE:g})")
     return splat
 
 

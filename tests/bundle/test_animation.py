@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -74,7 +75,7 @@ def test_the_unit_of_length_does_not_matter(bundle, view, output):
 
 
 def test_pngs_replace_those_of_a_longer_run(tmp_path):
-    (tmp_path / "frame_0007.png").write_bytes(b"")
+    write_frames(iter(FRAMES + FRAMES[:2]), tmp_path)
     (tmp_path / "other.png").write_bytes(b"")
     assert write_frames(iter(FRAMES), tmp_path) == 3
     names = sorted(p.name for p in tmp_path.iterdir())
@@ -83,7 +84,7 @@ def test_pngs_replace_those_of_a_longer_run(tmp_path):
 
 
 def test_pngs_that_others_named_stay(tmp_path):
-    theirs = ["frame_00001.png", "frame_00007.png", "frame_7.png", "frame_\u0661\u0662\u0663\u0664.png"]
+    theirs = ["frame_00001.png", "frame_0007.png", "frame_7.png", "frame_\u0661\u0662\u0663\u0664.png"]
     for name in theirs:
         (tmp_path / name).write_bytes(b"theirs")
     write_frames(iter(FRAMES), tmp_path)
@@ -96,6 +97,26 @@ def test_a_gif_has_all_frames(tmp_path):
         assert image.n_frames == 3 and image.size == (41, 31) and image.info["duration"] == 100
         image.seek(2)
         assert abs(int(np.asarray(image.convert("RGB"))[0, 0, 0]) - 250) < 5
+
+
+@pytest.mark.parametrize("fps", [0.001, 30])
+def test_a_gif_shows_frames_that_are_alike_as_long_as_they_last(tmp_path, fps):
+    frames = [FRAMES[0], FRAMES[0], FRAMES[1]]
+    assert write_frames(iter(frames), tmp_path / "a.gif", fps=fps) == 3
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == 2
+        assert image.info["duration"] == pytest.approx(min(2000 / fps, 655350), abs=10)  # of 16 bits, at most
+
+
+def test_a_video_goes_where_a_name_looks_like_a_protocol(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert write_frames(iter(FRAMES), Path("2024-05-01T10:30/a.mp4")) == 3
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
+    (tmp_path / "a.csv").write_text("mine")
+    with pytest.raises(InputError, match="a.csv: is a file; give"):
+        write_frames(iter(FRAMES), tmp_path / "a.csv")
 
 
 def test_a_video_has_all_frames_and_an_even_size(tmp_path):

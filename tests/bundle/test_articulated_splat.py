@@ -120,6 +120,46 @@ def test_parts_can_be_left_out(solid, camera):
     assert not nothing.rgb.any() and not nothing.alpha.any() and not nothing.part_ids.any()
 
 
+def test_a_part_may_be_named_alone(solid, camera):
+    torch.testing.assert_close(solid.render(camera, parts="door").rgb, solid.render(camera, parts=["door"]).rgb)
+
+
+def test_backgrounds_are_colours_or_images(solid, camera):
+    picture = solid.render(camera)
+    white = picture.over(torch.ones(3))
+    for same in ([1, 1, 1], np.ones(3), torch.ones(40, 48, 3)):
+        torch.testing.assert_close(picture.over(same), white)
+    for wrong in (1.0, [1, 1], np.ones((7, 7, 3)), "white"):
+        with pytest.raises(InputError, match="the background is no colour"):
+            picture.over(wrong)
+
+
+def test_a_device_that_is_not_there_is_refused(bundle):
+    for device in ("foo", "cuda:99"):
+        with pytest.raises(InputError, match=f"the device '{device}' cannot be used"):
+            ArticulatedSplat(bundle, device)
+
+
+def test_pictures_have_gradients_by_the_camera_whatever_the_default_dtype(solid, camera):
+    sideways = torch.zeros(4, 4, dtype=torch.float64)
+    sideways[0, 3] = solid.radius
+    target = solid.render(Camera(camera.T_world_camera + 0.05 * sideways, camera.K, *SIZE)).rgb
+
+    def loss(shift):
+        moved = Camera(camera.T_world_camera + shift * sideways, camera.K, *SIZE)
+        return (solid.render(moved).rgb - target).square().sum()
+
+    shift = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
+    torch.set_default_dtype(torch.float64)
+    try:
+        (slope,) = torch.autograd.grad(loss(shift), shift)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    with torch.no_grad():
+        numeric = (loss(0.01) - loss(-0.01)) / 0.02
+    assert float(slope) == pytest.approx(float(numeric), rel=0.1)
+
+
 def test_depth_and_labels_are_not_made_unless_asked_for(solid, camera):
     picture = solid.render(camera, depth=False, labels=False)
     assert picture.depth is None and picture.part_shares is None

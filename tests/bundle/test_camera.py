@@ -74,6 +74,7 @@ def test_a_camera_takes_arrays_lists_and_tensors():
     assert camera.batch == ()
     assert Camera(torch.eye(4).expand(5, 4, 4), camera.K.float(), 40, 32).batch == (5,)
     assert Camera(EYE, camera.K.expand(5, 3, 3), 40, 32).batch == (5,)
+    assert Camera(np.tile(EYE, (5, 1, 1))[::-1], camera.K, np.int64(40), np.int32(32)).width == 40
 
 
 @pytest.mark.parametrize(
@@ -89,8 +90,17 @@ def test_a_camera_takes_arrays_lists_and_tensors():
         (np.tile(EYE, (2, 1, 1)), np.tile(np.eye(3), (3, 1, 1)), 40, "2 T_world_camera but 3 K"),
         (EYE, (50, 50, 20, 16), 0, "width is 0"),
         (EYE, (50, 50, 20, 16), 40.5, "width is 40.5"),
+        (EYE, (50, 50, 20, 16), True, "width is True"),
+        (EYE, [[1], [1, 2]], 40, "give numbers"),
+        (EYE, (1e300, 50, 20, 16), 40, r"1e\+300; give pixels"),
     ],
 )
 def test_a_camera_that_cannot_be_is_refused(T, K, width, found):
     with pytest.raises(InputError, match=found):
         Camera(T, K, width, 32)
+
+
+@pytest.mark.parametrize(("radius", "width", "found"), [(-1.0, 40, "radius is -1.0"), (1.0, 0, "width is 0")])
+def test_no_camera_looks_at_nothing(radius, width, found):
+    with pytest.raises(InputError, match=found):
+        orbit_camera(np.zeros(3), radius, 0.0, 0.0, width, 32)

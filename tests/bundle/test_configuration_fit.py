@@ -1,6 +1,7 @@
 """The configuration of a known object in images of it."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -108,6 +109,14 @@ def test_a_part_that_no_label_shows_stays_and_is_named(cabinet):
     assert found.unseen == ["knob"]
     assert float(found.q["door_knob"]) == 0
     assert "knob" not in found.residual
+
+
+def test_a_part_without_gaussians_stays_and_is_named(cabinet):
+    views = views_of(cabinet, {"base_door": 0.5, "door_knob": 0.5})
+    nothing = cabinet.parts[0].splat.select(torch.tensor([], dtype=torch.long))
+    parts = [replace(part, splat=nothing) if part.name == "knob" else part for part in cabinet.parts]
+    found = fit_configuration(replace(cabinet, parts=parts), views, NORMALIZATION)
+    assert (found.unseen, float(found.q["door_knob"])) == (["knob"], 0)
 
 
 def test_a_part_that_is_not_seen_is_known_by_what_hangs_on_it(cabinet):

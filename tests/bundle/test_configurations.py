@@ -29,6 +29,11 @@ def test_values_are_radians_and_lengths_unless_degrees_are_asked_for(bundle):
     assert parse_settings(["hinge=-90DEG"], bundle) == {"hinge": pytest.approx(-math.pi / 2)}
 
 
+def test_a_name_may_have_an_equals_sign(bundle):
+    bundle.joints[0].name = "a=b"
+    assert parse_settings(["a=b=0.5"], bundle) == {"a=b": 0.5}
+
+
 def test_a_joint_may_be_called_by_the_part_that_it_moves(bundle, tmp_path):
     assert parse_settings(["door=0.5", "slide=0.1"], bundle) == {"hinge": 0.5, "slide": 0.1}
     (tmp_path / "q.json").write_text('{"door": 0.5}')

@@ -175,12 +175,16 @@ def test_a_folder_that_holds_something_else_is_refused(splat, dataset, bundle, t
     bundle.parts[0].splat.means[0] += 1e-3
     with pytest.raises(InputError, match="another bundle"):
         write_dataset(Dataset(ArticulatedSplat(bundle), OPTIONS), folder, 3)
+    bundle.parts[0].splat.means[0] -= 1e-3
+    bundle.joints[0].limits = (bundle.joints[0].limits[0], bundle.joints[0].limits[1] + 0.1)
+    with pytest.raises(InputError, match="another bundle"):
+        write_dataset(Dataset(ArticulatedSplat(bundle), OPTIONS), folder, 3)
     shutil.copytree(folder / "state_00", tmp_path / "other/state_00")
     with pytest.raises(InputError, match="no dataset of ours"):
         write_dataset(dataset, tmp_path / "other", 3)
 
 
-@pytest.mark.parametrize("options", [{"states": 0}, {"resolution": 7}, {"seed": -1}])
+@pytest.mark.parametrize("options", [{"states": 0}, {"states": 2.5}, {"resolution": 7}, {"views": "top"}, {"seed": -1}])
 def test_options_that_make_no_sense_are_refused(splat, options):
     with pytest.raises(InputError, match=f"--{next(iter(options))} is"):
         Dataset(splat, DatasetOptions(**options))
@@ -190,3 +194,18 @@ def test_fewer_images_than_states_are_refused(dataset, tmp_path):
     with pytest.raises(InputError, match="--dataset is 2; give at least an image for each of the 3 --states"):
         write_dataset(dataset, tmp_path / "capture", 2)
     assert not (tmp_path / "capture").exists()
+
+
+def test_fewer_images_than_there_are_would_leave_some_behind(dataset, tmp_path):
+    write_dataset(dataset, tmp_path / "capture", 6)
+    before = contents(tmp_path / "capture")
+    with pytest.raises(InputError, match="holds 6 images, more than --dataset 3"):
+        write_dataset(dataset, tmp_path / "capture", 3)
+    assert contents(tmp_path / "capture") == before
+
+
+def test_a_part_without_gaussians_has_no_geometry(bundle, tmp_path):
+    bundle.parts[2].splat = bundle.parts[2].splat.select(torch.tensor([], dtype=torch.long))
+    write_dataset(Dataset(ArticulatedSplat(bundle), OPTIONS), tmp_path / "capture", 3)
+    truth = load_ground_truth(tmp_path / "capture")
+    assert list(truth.parts.values()) == [part.name for part in bundle.parts[:2]] and len(truth.points) == 2

@@ -113,6 +113,7 @@ PART, JOINT = ("parts", 1), ("joints", 1)
         (set_(*PART, "id", value=2.5), "id"),
         (set_(*PART, "name", value="base"), "twice"),
         (set_(*PART, "name", value=""), "empty"),
+        (set_(*PART, "name", value="l\ud800"), "half a character"),
         (set_(*PART, "splat", value="../door.ply"), "inside the bundle"),
         (set_(*PART, "splat", value="/etc/passwd"), "inside the bundle"),
         (set_(*PART, "splat", value="parts/\0"), "inside the bundle"),

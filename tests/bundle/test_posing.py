@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -57,11 +58,24 @@ def test_a_batch_of_values_gives_the_motions_one_by_one(kind):
         ("spherical", [[0.1, 0.2]], r"takes 3 values, not shape \[1, 2\]"),
         ("revolute", "wide", "'wide' are no numbers"),
         ("revolute", [0.1, math.nan], "not finite"),
+        ("revolute", 10**400, "are no numbers"),
+        ("revolute", [[0.1, 0.2], [0.3]], "are no numbers"),
     ],
 )
 def test_a_value_that_cannot_be_is_refused(kind, value, found):
     with pytest.raises(InputError, match=found):
         joint_motion(joint(kind), value)
+
+
+def test_values_are_read_from_views_of_arrays_and_lists_of_tensors():
+    values = np.linspace(0.0, 0.6, 5)
+    torch.testing.assert_close(
+        joint_motion(joint("revolute"), values[::-1]).flip(0), joint_motion(joint("revolute"), values)
+    )
+    value = torch.tensor(0.1, requires_grad=True)
+    T = joint_motion(joint("revolute"), [value, torch.tensor(0.2)])
+    (slope,) = torch.autograd.grad(T.sum(), value)
+    assert T.shape == (2, 4, 4) and slope != 0
 
 
 def test_observed_values_give_the_observed_motions(bundle):

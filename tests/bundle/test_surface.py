@@ -121,6 +121,20 @@ def test_a_faint_far_gaussian_changes_nothing():
     assert mesh.volume == pytest.approx(0.24, rel=0.15)
 
 
+@pytest.mark.parametrize("far", [3.0, 1000.0])
+def test_an_opaque_gaussian_far_away_changes_nothing(far):
+    box = splat_on(trimesh.creation.box((1, 0.6, 0.4)))
+    stray = few([[far, far, far]], (0.02, 0.02, 0.02))
+    mesh, alone = part_surface(Splat.cat([box, stray]), voxels=VOXELS), part_surface(box, voxels=VOXELS)
+    assert np.array_equal(mesh.vertices, alone.vertices)
+
+
+def test_pieces_of_a_part_apart_from_each_other_all_stay():
+    pieces = [trimesh.creation.box((0.2, 0.2, 0.2)).apply_translation((x, 0, 0)) for x in (0.0, 5.0)]
+    mesh = part_surface(Splat.cat([splat_on(piece) for piece in pieces]))
+    assert mesh.bounds[1, 0] > 5
+
+
 def test_haze_in_a_hollow_does_not_fill_it():
     box = trimesh.creation.box((1, 0.6, 0.4))
     box.update_faces(box.face_normals[:, 2] < 0.5)

@@ -142,12 +142,21 @@ def test_a_value_that_is_not_finite_is_refused_by_name(ply, value):
         read_ply(ply)
 
 
-def test_a_zero_quaternion_is_refused(ply):
+@pytest.mark.parametrize(
+    ("columns", "value", "found"),
+    [
+        (slice(-4, None), 0.0, "rotation of vertex 2 is 0 0 0 0;"),
+        (slice(-4, None), 1e-30, "rotation of vertex 2"),
+        (slice(-4, None), 1e30, "rotation of vertex 2"),
+        (-5, 100.0, "scale_2 of vertex 2 is 100"),
+    ],
+)
+def test_a_gaussian_that_cannot_be_rendered_is_refused(ply, columns, value, found):
     header, end, body = ply.read_bytes().partition(b"end_header\n")
     table = np.frombuffer(body, "<f4").reshape(5, -1).copy()
-    table[2, -4:] = 0
+    table[2, columns] = value
     ply.write_bytes(header + end + table.tobytes())
-    with pytest.raises(InputError, match="rotation of vertex 2"):
+    with pytest.raises(InputError, match=found):
         read_ply(ply)
 
 

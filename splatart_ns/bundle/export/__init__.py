@@ -1,6 +1,6 @@
 """The result as files that robot simulators, viewers and 3D programs open, checked by those programs."""
 
-from splatart_ns.bundle.export.describe import DENSITY, LIMIT_MARGIN, describe
+from splatart_ns.bundle.export.describe import DENSITY, LIMIT_MARGIN, check_numbers, describe
 from splatart_ns.bundle.export.folder import check_folder
 from splatart_ns.bundle.export.formats import WITHOUT_MESHES, Format, export, format_notes, require
 from splatart_ns.bundle.export.robot import Robot
@@ -16,6 +16,7 @@ __all__ = [
     "PartShape",
     "Robot",
     "check_folder",
+    "check_numbers",
     "describe",
     "export",
     "format_checks",

@@ -16,6 +16,7 @@ from splatart_ns.bundle.export.overlap import overlaps
 from splatart_ns.bundle.export.robot import Joint, Link, Loop, Robot
 from splatart_ns.bundle.export.shapes import PartShape
 from splatart_ns.bundle.posing import configured_motions
+from splatart_ns.errors import InputError
 
 DENSITY = 400.0
 """kg / m^3, of the filled mesh: between hollow furniture and solid wood."""
@@ -23,6 +24,8 @@ LIMIT_MARGIN = 0.05
 """Of the observed range, by which limits are wider at both ends."""
 _SIZES = (0.005, 50.0)
 """Metres, of objects that simulators can be trusted with."""
+_MOST, _MOST_MARGIN = 1e6, 100.0
+"""Bounds of scales and densities, one way and the other, and of margins."""
 _GUESSED = 0.1
 """A larger share of a part's surface that nobody saw is told."""
 _METRES = {
@@ -30,6 +33,15 @@ _METRES = {
     **dict.fromkeys(("centimetre", "centimeter", "centimetres", "centimeters", "cm"), 0.01),
     **dict.fromkeys(("millimetre", "millimeter", "millimetres", "millimeters", "mm"), 0.001),
 }
+
+
+def check_numbers(scale: float | None, density: float, limit_margin: float) -> None:
+    """Raise InputError for numbers that `describe` cannot take."""
+    for name, number in {"scale": 1.0 if scale is None else scale, "density": density}.items():
+        if not 1 / _MOST <= number <= _MOST:
+            raise InputError(f"--{name} is {number}; give a number from {1 / _MOST:g} to {_MOST:g}")
+    if not 0 <= limit_margin <= _MOST_MARGIN:
+        raise InputError(f"--limit-margin is {limit_margin}; give a number from 0 to {_MOST_MARGIN:g}")
 
 
 def metres_per_unit(bundle: Bundle, scale: float | None) -> tuple[float, list[str]]:
@@ -59,7 +71,11 @@ def describe(
         scale: Metres per unit of the bundle; by default as its unit says, else 1.
         density: kg / m^3.
         limit_margin: How much wider than the observed range the limits are at both ends, in ranges.
+
+    Raises:
+        InputError: a scale, density or margin as in `check_numbers`.
     """
+    check_numbers(scale, density, limit_margin)
     metres, notes = metres_per_unit(bundle, scale)
     names = dict(zip(bundle.part_names, identifiers(bundle.part_names), strict=True))
     tree = {joint.child: joint for joint in bundle.tree_joints}

@@ -23,7 +23,7 @@ def export_folder(path: Path, about: dict) -> Iterator[Path]:
     The manifest lists the files and holds `about`.
 
     Raises:
-        InputError: `path` is a file, or holds what no earlier export wrote.
+        InputError: `path` is a file, holds what no earlier export wrote, or the current folder.
     """
     path = Path(path).resolve()
     check_folder(path)
@@ -40,7 +40,9 @@ def export_folder(path: Path, about: dict) -> Iterator[Path]:
 
 
 def check_folder(path: Path) -> None:
-    """Raise InputError if `path` is a file, or holds what no earlier export wrote."""
+    """Raise InputError if `path` is a file, holds what no earlier export wrote, or the folder that we are in."""
+    if path.exists() and Path.cwd().is_relative_to(path.resolve()):
+        raise InputError(f"{path}: is, or holds, the folder that you are in; go elsewhere, or give another --output")
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; give a folder for the export with --output")
     if not (present := _files(path) if path.is_dir() else set()):

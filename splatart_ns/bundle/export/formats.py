@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, get_args
 
 from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.export.folder import export_folder
@@ -29,8 +29,10 @@ def export(bundle: Bundle, robot: Robot, form: Format, folder: Path) -> Path:
     Returns the file, in `folder`. Beside it are its meshes and `export.json`: names, scale, notes and all files.
 
     Raises:
-        InputError: the folder holds what no export wrote, or the format's library is not installed.
+        InputError: the folder holds what no export wrote, the format is none or its library is not installed.
     """
+    if form not in get_args(Format):
+        raise InputError(f"the format is {form!r}; give one of {', '.join(get_args(Format))}")
     require([form])
     with export_folder(folder, _about(robot, form)) as fresh:
         if form == "ply":
@@ -66,15 +68,16 @@ def format_notes(robot: Robot, form: Format) -> list[str]:
     return notes
 
 
-def _about(robot: Robot, form: Format) -> Mapping:
+def _about(robot: Robot, form: Format) -> Mapping[str, Any]:
     if form == "html":  # has the bundle's own names and units
         return {"of": form}
-    return {
+    about = {
         "of": form,
         "metres_per_unit": robot.scale,
         "links": {link.part: link.name for link in robot.links.values()},
         "joints": {j.source: [f.name for f in j.freedoms] for j in robot.joints if j.source is not None},
-        "mass": {link.name: link.inertia.mass for link in robot.links.values()},
-        "overlapping_at_rest": [{"links": list(pair), "depth": d} for pair, d in robot.overlaps.items()],
-        "notes": [*robot.notes, *format_notes(robot, form)],
     }
+    if form not in WITHOUT_MESHES:
+        about["mass"] = {link.name: link.inertia.mass for link in robot.links.values()}
+        about["overlapping_at_rest"] = [{"links": list(pair), "depth": d} for pair, d in robot.overlaps.items()]
+    return about | {"notes": [*robot.notes, *format_notes(robot, form)]}

@@ -29,7 +29,8 @@ def write_urdf(robot: Robot, folder: Path) -> Path:
     _add_mimics(tree, robot)
     _add_mujoco(tree)
     path = folder / f"{robot.name}.urdf"
-    tree.write(str(path), xml_declaration=True, encoding="utf-8", pretty_print=True)
+    with path.open("wb") as file:  # lxml would take a name with '%' for a URI
+        tree.write(file, xml_declaration=True, encoding="utf-8", pretty_print=True)
     return path
 
 

@@ -70,7 +70,16 @@ def test_the_bundle_itself_is_not_overwritten(run_main, folder):
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("scale", 0), ("scale", "nan"), ("density", -1), ("density", "inf"), ("limit-margin", -0.1)]
+    ("option", "value"),
+    [
+        ("scale", 0),
+        ("scale", "nan"),
+        ("density", -1),
+        ("density", "inf"),
+        ("limit-margin", -0.1),
+        ("scale", 1e300),
+        ("limit-margin", 1e308),
+    ],
 )
 def test_numbers_that_make_no_sense_are_refused(run_main, folder, option, value):
     code, _, errors = run_main("export", folder, "--format", "urdf", f"--{option}", value)

@@ -69,6 +69,14 @@ def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
         write(tmp_path / "out", "a.txt")
 
 
+def test_the_folder_that_one_is_in_is_not_replaced(tmp_path, monkeypatch):
+    write(tmp_path / "out", "a.txt", "in/b.txt")
+    monkeypatch.chdir(tmp_path / "out" / "in")
+    with pytest.raises(InputError, match="the folder that you are in"):
+        write(tmp_path / "out", "a.txt")
+    assert (tmp_path / "out" / "in" / "b.txt").is_file()
+
+
 def test_a_run_that_breaks_leaves_the_last_export(tmp_path):
     write(tmp_path / "out", "a.txt")
     with pytest.raises(RuntimeError), export_folder(tmp_path / "out", {}) as folder:

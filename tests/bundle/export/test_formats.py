@@ -128,6 +128,22 @@ def test_the_whole_ply_has_all_gaussians_in_metres(objects, write):
         np.testing.assert_allclose(own.scales, 0.5 * part.splat.scales, rtol=1e-5)
 
 
+def test_what_has_no_meshes_has_no_masses(write):
+    told = [json.loads((write(form).parent / "export.json").read_text()) for form in ("urdf", "ply")]
+    assert [set(about) & {"mass", "overlapping_at_rest"} for about in told] == [{"mass", "overlapping_at_rest"}, set()]
+
+
+def test_a_urdf_goes_where_the_name_looks_like_an_address(objects, tmp_path):
+    bundle = objects.chain(["revolute"])
+    assert export(bundle, objects.robot(bundle), "urdf", tmp_path / "50% done \u00e4").is_file()
+
+
+def test_a_format_that_is_none_is_refused(objects, tmp_path):
+    bundle = objects.chain(["revolute"])
+    with pytest.raises(InputError, match="the format is 'obj'; give one of urdf"):
+        export(bundle, objects.robot(bundle), "obj", tmp_path / "out")
+
+
 def test_the_same_bundle_gives_the_same_files(objects, tmp_path):
     for form in ("urdf", "mjcf", "glb", "ply"):
         texts = []
