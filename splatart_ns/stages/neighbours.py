@@ -37,7 +37,9 @@ def turned_as_neighbours_let(
     alike and that a joint makes.
 
     Of what turns over against all that it touches, more motions are sought that look alike in even light. Those parts
-    go first whose motions are not in doubt; from them it spreads to what touches them.
+    go first that rest, and those whose motions are not in doubt and make a joint with another such part; from them it
+    spreads to what touches them. A wrist in the jaws of a fork fitted better turned over, as it was lit, and the fork
+    was in doubt until what carries it had told how that moves.
 
     Args:
         splats: The labelled splats of the one and the other state.
@@ -47,16 +49,19 @@ def turned_as_neighbours_let(
     motions = dict(motions)
     parts = _Parts.of(splats, [p for p, motion in motions.items() if motion.found])
     alone = {p: motions[p].T for p in parts.near if not motions[p].alike}
-    sure = {p for p in alone if not parts.turns_over(p, alone)}
+    upright = {p for p in alone if not parts.turns_over(p, alone)}
     rest = {p: T for p, T in alone.items() if motions[p].still}
-    settled = sure | rest.keys()
+    settled = rest.keys() | {p for p in upright if parts.jointed_to_any(p, alone)}
     waiting = parts.near.keys() - settled
-    while reached := {p: parts.near[p] & settled for p in waiting if parts.near[p] & settled}:
+    while waiting:
+        reached = {p: parts.near[p] & settled for p in waiting if parts.near[p] & settled}
         for p, others in reached.items():
             fixed = {q: motions[q].T for q in others}
             motions[p] = _jointed(splats, views, p, motions[p], parts, fixed, rest)
-        settled |= reached.keys()
-        waiting -= reached.keys()
+        if not (now := reached.keys() or waiting & upright):
+            break
+        settled |= now
+        waiting -= now
     return motions
 
 
@@ -113,6 +118,11 @@ class _Parts:
         """Whether a part turns over against all that it touches of the parts whose motions [4, 4] are given."""
         turns = [_turn(inverse(motions[q]) @ motions[part]) for q in self.near[part] & motions.keys()]
         return bool(turns) and min(turns) > TURNED_OVER
+
+    def jointed_to_any(self, part: int, motions: Mapping[int, Tensor]) -> bool:
+        """Whether a part may be jointed to any that it touches of the parts whose motions [4, 4] are given."""
+        others = self.near[part] & motions.keys()
+        return any(self.may_be_jointed(part, q, inverse(motions[q]) @ motions[part]) for q in others)
 
     def may_be_jointed(self, a: int, b: int, T: Tensor) -> bool:
         """Whether T [4, 4], by which part a moves against part b, slides it or turns it about a hinge of both, but not

@@ -152,3 +152,24 @@ def test_a_part_that_is_not_in_doubt_stays_so_beside_one_that_is():
     states = Splat.cat(list(parts.values())), Splat.cat(list(moved.values()))
     found = turned_as_neighbours_let(states, ([], []), motions)
     assert torch.equal(found[3].T, elbow) and torch.equal(found[4].T, forearm)
+
+
+def test_a_part_beside_others_in_doubt_waits_for_what_they_turn_out_to_do():
+    """A plain wrist that fits best turned over, on a forearm that is in doubt until the arm has told how it moves."""
+    places = {1: 0.0, 2: 0.5, 3: 0.9}
+    sizes = {1: (0.5, 0.3, 0.2), 2: (0.5, 0.3, 0.2), 3: (0.3, 0.2, 0.12)}
+    arm, forearm, wrist = (box(part, sizes[part], (x, 0.0, 0.0), 0.04, num_parts=3) for part, x in places.items())
+    wrist.sh = torch.zeros_like(wrist.sh)
+    first = about(motion((0, 0, 40), (0, 0, 0)), torch.tensor([0.25, 0.1, 0.0]).double())
+    second = first @ about(motion((0, 0, 50), (0, 0, 0)), torch.tensor([0.75, 0.1, 0.0]).double())
+    centre = torch.tensor([0.9, 0.0, 0.0]).double()
+    over = second @ about(motion((180, 0, 0), (0, 0, 0)), centre)
+    states = Splat.cat([arm, forearm, wrist]), Splat.cat([arm, forearm.transformed(first), wrist.transformed(second)])
+    motions = {
+        1: RESTS,
+        2: InitialMotion(first @ over, found=True, alike=(first,)),
+        3: InitialMotion(over, found=True),
+    }
+    found = turned_as_neighbours_let(states, tuple(photograph(s) for s in states), motions)
+    assert torch.equal(found[2].T, first)
+    assert angle_deg(found[3].T, second) < 1 and torch.equal(found[3].alike[0], over)
