@@ -140,6 +140,30 @@ def test_a_finished_fit_is_left_alone(fit_copy, hinge_capture, run_main):
     assert contents(fit_copy) == before
 
 
+def test_a_finished_fit_is_left_alone_however_its_capture_is_spelled(fit_copy, hinge_capture, run_main, monkeypatch):
+    before = contents(fit_copy)
+    monkeypatch.chdir(hinge_capture)
+    again = f"../{hinge_capture.name}"
+    assert run_main("fit", again, "--output-dir", fit_copy, "--quality", "draft")[0] == 0
+    assert contents(fit_copy) == before
+
+
+def test_a_fit_does_not_go_among_the_images(hinge_capture, run_main, tmp_path):
+    capture = tmp_path / "capture"
+    shutil.copytree(hinge_capture, capture)
+    frames = []
+    for k in range(2):
+        meta = json.loads((capture / f"state_{k:02d}/transforms.json").read_text())
+        for frame in meta.pop("frames"):
+            paths = {key: f"state_{k:02d}/{value}" for key, value in frame.items() if key.endswith("path")}
+            frames.append({**frame, **paths, "state": k})
+        (capture / f"state_{k:02d}/transforms.json").unlink()
+    shared = {key: value for key, value in meta.items() if not key.endswith("filenames")}
+    (capture / "transforms.json").write_text(json.dumps({**shared, "frames": frames}))
+    code, _, errors = run_main("fit", capture, "--output-dir", capture / "state_00/images/out", "--quality", "draft")
+    assert code == 2 and "holds the capture's files" in errors
+
+
 def test_a_damaged_bundle_is_written_again(fit_copy, hinge_fit, hinge_capture, run_main):
     (fit_copy / "articulation.json").write_text("{")
     (fit_copy / "parts/lid.ply").unlink()

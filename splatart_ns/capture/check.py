@@ -56,6 +56,9 @@ def check_structure(path: Path) -> tuple[Capture | None, list[Problem]]:
         if (strange := looks_elsewhere(capture, state)) is not None:
             problems.append(Problem("warning", capture.path / state.name, strange, OTHER_WORLDS_MEND))
         problems.extend(_check_silhouettes(capture, state, [by_frame[id(f)] for f in state.frames]))
+        if (train := state.split("train")) and all(by_frame[id(f)].masked_out for f in train):
+            found, mend = "the masks leave no pixel of any training frame", "white must be what counts: invert them"
+            problems.append(Problem("error", capture.path / state.name, found, mend))
         problems.extend(_check_points(state))
     pixels = [sum((by_frame[id(f)].pixels for f in s.split("train")), np.zeros(256, int)) for s in capture.states]
     problems.extend(_check_labels(capture, np.array(pixels)))
@@ -74,6 +77,8 @@ class _Content:
     """Number of pixels of each label [256]."""
     silhouette: float | None = None
     """The part of the image inside the silhouette, if the frame has one."""
+    masked_out: bool = False
+    """Whether the mask leaves no pixel to the loss."""
 
 
 def _look(frame: Frame, parts: dict[int, str]) -> _Content:
@@ -88,12 +93,13 @@ def _look(frame: Frame, parts: dict[int, str]) -> _Content:
 
     image = read(frame.image, read_image)
     silhouette = read(frame.object_mask, read_mask)
-    if frame.object_mask is None and image is not None and image.shape[2] == 4:
+    if frame.object_mask is None and image is not None and image.shape[2] == 4 and not (image[..., 3] == 255).all():
         silhouette = image[..., 3]
     if silhouette is not None:
         content.silhouette = float((silhouette > 127).mean())
     mask = read(frame.mask, read_mask)
     if mask is not None and not mask.any():
+        content.masked_out = True
         message, mend = "the mask leaves no pixel to the loss", "white must be what counts; or take the frame out"
         content.problems.append(Problem("warning", frame.mask, message, mend))
     if frame.depth is not None and image is not None:  # which has the camera's size, and so a bearable one

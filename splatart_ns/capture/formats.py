@@ -26,6 +26,7 @@ from splatart_ns.capture.part_names import read_part_names
 from splatart_ns.capture.peer_layouts import peer_reader
 from splatart_ns.capture.values import (
     inner_path,
+    own_before,
     parse_camera,
     parse_matrix,
     parse_pose,
@@ -302,7 +303,7 @@ def _frame(file: Path, root: Path, name: str, meta: dict[str, Any], entry: dict[
     return Frame(
         name=name,
         image=image,
-        camera=parse_camera(file, owner, {**meta, **entry}, image),
+        camera=parse_camera(file, owner, own_before(entry, meta), image),
         T_world_camera=parse_pose(file, owner, entry.get("transform_matrix")),
         split=split,
         labels=optional("semantics_path"),

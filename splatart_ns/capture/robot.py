@@ -167,7 +167,8 @@ class Robot:
         return merge_coincident(join(surfaces)) if surfaces else None
 
     def _link_surfaces(self, link: str) -> list[Surface]:
-        return [_visual(v, self.path).moved(_origin(v, self.path)) for v in self.links[link]]
+        visuals = self.links[link]
+        return [_visual(v, self.path).moved(_origin(v, self.path)) for v in visuals if not _is_point(v, self.path)]
 
 
 def read_urdf(path: Path) -> Robot:
@@ -304,6 +305,12 @@ def _children(joints: tuple[Joint, ...]) -> dict[str, list[Joint]]:
     return out
 
 
+def _is_point(visual: ElementTree.Element, path: Path) -> bool:
+    """Whether a <visual> is a box or a sphere without any extent, as some robots have for links without a shape."""
+    sizes = [(visual.find(f"geometry/{tag}"), key, n) for tag, key, n in (("box", "size", 3), ("sphere", "radius", 1))]
+    return any(shape is not None and not _numbers(shape, key, n, path).any() for shape, key, n in sizes)
+
+
 def _visual(visual: ElementTree.Element, path: Path) -> Surface:
     """The shape of a <visual>, before its <origin>."""
     colour_element = visual.find("material/color")
@@ -314,6 +321,8 @@ def _visual(visual: ElementTree.Element, path: Path) -> Surface:
     shape = shapes[0]
     if shape.tag == "mesh":
         scale = _numbers(shape, "scale", 3, path, "1 1 1")
+        if not scale.all():
+            raise InputError(f"{path}: <mesh scale={shape.get('scale')!r}> makes the mesh flat; mend it.")
         mesh = find_mesh(_attribute(shape, "filename", path), path)
         return meshes.load_mesh(mesh, colour).moved(np.diag([*scale, 1.0]))
     if shape.tag == "box":
@@ -334,10 +343,11 @@ def find_mesh(name: str, urdf: Path) -> Path:
     if not name.startswith(("package://", "model://")):
         return folder / name.removeprefix("file://")
     package, _, rest = name.split("://", 1)[1].partition("/")
-    for above in (folder, *folder.parents):
-        for root in (above / package, above):
-            if (root / rest).is_file():
-                return root / rest
+    around = (folder, *folder.parents)
+    # Another package may have a file of the same path, so that of this name is looked for everywhere first.
+    for root in (*(above / package for above in around), *around):
+        if (root / rest).is_file():
+            return root / rest
     found = [above / package for above in (folder, *folder.parents) if (above / package).is_dir()]
     mend = f"{found[0]} has no {rest}; put that file there" if found else f"put the package {package!r} there"
     raise InputError(f"{urdf}: {name} is not found in the folders above the URDF; {mend}.")

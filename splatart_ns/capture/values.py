@@ -22,6 +22,10 @@ from splatart_ns.plain_yaml import parse_yaml
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_TOGETHER = (
+    {"fl_x", "fl_y", "camera_angle_x", "camera_angle_y"},
+    {*DISTORTION, "distortion_params"},
+)
 _MOST_BYTES = 256 << 20
 LONGEST = 1e12  # a coordinate or focal length beyond this is a mistake, and its square still is a float
 
@@ -120,6 +124,14 @@ def parse_matrix(file: Path, what: str, value: Any, shapes: Sequence[tuple[int, 
 
 def show(value: Any) -> str:
     return reprlib.repr(value)
+
+
+def own_before(entry: dict[str, Any], meta: dict[str, Any]) -> dict[str, Any]:
+    """A frame's own values, and those of its file that they do not replace: a focal length of its own replaces both, in
+    either form, and so does a distortion."""
+    given = {key for key, value in entry.items() if value is not None}
+    replaced = {key for group in _TOGETHER if group & given for key in group}
+    return {key: value for key, value in meta.items() if key not in replaced} | entry
 
 
 def parse_camera(file: Path, owner: str, values: dict[str, Any], image: Path) -> Camera:

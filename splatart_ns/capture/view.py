@@ -111,7 +111,7 @@ def load_views(capture: Capture, state: int | State, split: str = "train", downs
 
 def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) -> View:
     """One view. Its alpha is the image's where there is one, without what the frame's object mask leaves out; for an
-    opaque image it is the mask, and None when there is neither.
+    opaque image, also one whose alpha is 255 everywhere, it is the mask, and None when there is none.
 
     Raises `InputError` for a file that cannot be used.
     """
@@ -125,11 +125,11 @@ def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) ->
 
     image = read(frame.image, read_image)
     alpha = labels = mask = depth = None
-    if image.shape[2] == 4:
+    if image.shape[2] == 4 and not (image[..., 3] == 255).all():
         alpha = torch.from_numpy(np.ascontiguousarray(image[..., 3]))
     if frame.object_mask is not None:
         silhouette = read(frame.object_mask, read_mask)
-        if alpha is None or bool((alpha == 255).all()):
+        if alpha is None:
             alpha = torch.from_numpy(silhouette)
         else:  # a mask is hard where the alpha is soft: leave the pixels along its edge to the alpha
             alpha = torch.minimum(alpha, torch.from_numpy(cv2.dilate(silhouette, np.ones((3, 3), np.uint8))))

@@ -70,9 +70,9 @@ class SplatartDatamanagerConfig(FullImageDatamanagerConfig):
 
     _target: type = field(default_factory=lambda: SplatartDatamanager)
     seed_gaussians: int = 0
-    """Most points inside the silhouettes to start Gaussians from, when the capture has no point cloud; small objects
-    get fewer. And, where images are opaque, at most so many on what surrounds the object, from the point cloud if there
-    is one."""
+    """Most points inside the silhouettes to start Gaussians from; small objects get fewer. And, where images are
+    opaque, at most so many on what surrounds the object, from the capture's point cloud if there is one. Where
+    silhouettes leave no hull, Gaussians start from that cloud."""
     seed: int = 0
     """Seed of those points."""
 
@@ -122,7 +122,8 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
                 self.train_dataset.metadata["points3D_around"] = len(around.xyz)
         else:
             self.slack, hull = slack(views)
-            if points is None and hull is not None:
+            # A cloud of structure from motion has most of its points around the object, and few on it.
+            if hull is not None:
                 points = seed_points(views, num_parts, count, generator, hull, seen_surface(views, *hull))
                 self.train_dataset.metadata["points3D_inside"] = len(points.xyz)
         if points is not None:

@@ -90,7 +90,7 @@ class Settings:
 def report_head(capture: Capture, settings: Settings) -> dict[str, Any]:
     """What was fitted, how, and by what."""
     return {
-        "capture": str(capture.path.absolute()),
+        "capture": str(capture.path.resolve()),
         "capture_sha256": capture_digest(capture),
         "settings": asdict(settings.of(capture)),
         "seed": settings.seed,
@@ -194,7 +194,9 @@ def fit(
     set_backend(rasterizer)
     settings = Settings(quality, root, seed, rasterizer, list(joints), worlds, refine_cameras)
     capture = require_fittable(capture_path, settings)
-    if is_inside(output_dir, capture_path) or any(is_inside(capture_path / s.name, output_dir) for s in capture.states):
+    folders = {capture_path / s.name for s in capture.states}
+    folders |= {frame.image.parent for s in capture.states for frame in s.frames} - {capture_path}
+    if is_inside(output_dir, capture_path) or any(is_inside(folder, output_dir) for folder in folders):
         raise InputError(f"{output_dir} holds the capture's files; choose another --output-dir, beside it.")
     output_dir = output_dir.absolute()
     report = Report(output_dir / "report.json", capture, settings)

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
@@ -29,7 +30,7 @@ from splatart_ns.plugin.compat import finished_runs, read_checkpoint
 from splatart_ns.plugin.gaussians import SPLAT_SHAPES, gauss_params_from_splat, splat_from_state
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
+from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics, shifted
 from splatart_ns.stages.joint_constraint import parse_constraints
 from splatart_ns.stages.joint_fit import JointFit
 from splatart_ns.stages.joint_parameters import JOINT_DOFS, JOINT_LENGTHS
@@ -230,7 +231,11 @@ class JointPipeline(VanillaPipeline):
         part_covariances = {p: covariances[:, p - 1] for p in capture.parts}
         known = known_states(part_motions, part_covariances)
         present = [p for p in capture.parts if bool((ids == p).any())]
-        points = {p: surface_points(world.select(ids == p)) for p in present}
+        # Joints are found about the object's place: the world's origin may be a thousand objects away, as a map's is.
+        here = replace(normalization, centre=np.zeros(3))
+        beside, motions_here = splat_to_world(splat, here), torch.from_numpy(here.motion_to_world(base.numpy()))
+        covariances_here = covariances_to_world(state["_model.covariance"], here)
+        points = {p: surface_points(beside.select(ids == p)) for p in present}
         held = state["_model.held_ratio"]
         ratios = {
             (a, b): float(held[a - 1, b - 1])
@@ -245,8 +250,8 @@ class JointPipeline(VanillaPipeline):
             )
         self.tree = infer_tree(
             points,
-            {p: part_motions[p] for p in present},
-            covariances={p: part_covariances[p] for p in present},
+            {p: motions_here[:, p - 1] for p in present},
+            covariances={p: covariances_here[:, p - 1] for p in present},
             root=root,
             render_ratios=ratios,
             epsilon=config.epsilon,
@@ -254,7 +259,7 @@ class JointPipeline(VanillaPipeline):
             constraints=parse_constraints(config.joints, capture.parts, root),
             names=capture.parts,
         )
-        self.tree = doubted(self.tree, state["_model.alike"])
+        self.tree = doubted(shifted(self.tree, torch.from_numpy(normalization.centre)), state["_model.alike"])
         self.notes = [f"{capture.parts[part]}: {reason}" for part, reason in self.tree.unattached.items()]
         self.notes += [other_parent_note(j, capture.parts) for j in self.tree.joints if j.other is not None]
         for note in self.notes:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from splatart_ns.geometry.se3 import adjoint, from_rotation_translation
 from splatart_ns.stages.joint_fit import JointFit
 
 
@@ -57,6 +58,24 @@ class KinematicTree:
         states = len(self.joints[0].fit.values) if self.joints else 1
         values = [j.fit.values.reshape(states, j.fit.dofs) for j in self.movable]
         return torch.cat(values, -1) if values else torch.zeros(states, 0).double()
+
+
+def shifted(tree: KinematicTree, by: Tensor) -> KinematicTree:
+    """The tree in a world in which every point lies further along `by` [3]."""
+
+    def moved(joint: Joint | None) -> Joint | None:
+        if joint is None:
+            return None
+        fit = joint.fit
+        values = fit.values
+        if fit.type == "free":  # tangents about the world's origin
+            values = values @ adjoint(from_rotation_translation(torch.eye(3).to(by), by)).to(values).mT
+        return replace(
+            joint, fit=replace(fit, origin=fit.origin + by.to(fit.origin), values=values), other=moved(joint.other)
+        )
+
+    groups = {name: [moved(joint) for joint in getattr(tree, name)] for name in ("joints", "loops", "rejected")}
+    return replace(tree, **groups)
 
 
 def forward_kinematics(

@@ -88,12 +88,15 @@ def carve(views: Sequence[View], grid: Tensor, dilate: int, erring: int = 0) -> 
     """Which points [N, 3] lie inside every silhouette but `erring` ones, and are seen at all: [N] bool.
 
     A point beyond an image's border counts as outside, unless the silhouette is cut off by the border: then that view
-    says nothing of it. `dilate` widens the silhouettes by so many pixels. If views may err, what is `FAINT` counts.
+    says nothing of it. Nor does one with an empty silhouette, which would leave no point at all. `dilate` widens the
+    silhouettes by so many pixels. If views may err, what is `FAINT` counts.
     """
     left = torch.arange(len(grid))
     seen, missed = torch.zeros(len(grid), dtype=torch.bool), torch.zeros(len(grid), dtype=torch.int32)
     for view in views:
         silhouette = view.alpha > (FAINT if erring else 127)
+        if not silhouette.any():
+            continue
         border = torch.cat([*silhouette[[0, -1]], *silhouette[:, [0, -1]].T])
         column, row, _, visible = project(view, grid[left])
         missed += ~torch.where(visible, widened(silhouette, dilate)[row, column], border.any())

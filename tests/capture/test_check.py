@@ -135,10 +135,19 @@ def test_only_empty_silhouettes_are_an_error(capture_folder):
     assert found(check_capture(capture_folder)) == ["state_00: all silhouettes are empty"]
 
 
-def test_opaque_images_are_told_from_silhouettes(capture_folder):
+def test_opaque_images_are_told_from_silhouettes(capture_folder, edit):
     for file in (capture_folder / "state_00/images").iterdir():
         put(file, np.full((16, 16, 4), 255, np.uint8))
+    assert found(check_capture(capture_folder), "warning") == []
+    put(capture_folder / "state_00/all.png", np.full((16, 16), 255, np.uint8))
+    edit(capture_folder / FILE, lambda m: [frame.update(object_mask_path="all.png") for frame in m["frames"]])
     assert ["fill their images" in w for w in found(check_capture(capture_folder), "warning")] == [True]
+
+
+def test_masks_that_leave_nothing_to_learn_from_are_an_error(capture_folder, edit):
+    put(capture_folder / "state_00/none.png", np.zeros((16, 16), np.uint8))
+    edit(capture_folder / FILE, lambda m: [frame.update(mask_path="none.png") for frame in m["frames"]])
+    assert found(check_capture(capture_folder)) == ["state_00: the masks leave no pixel of any training frame"]
 
 
 def test_cameras_on_one_spot_are_an_error(capture_folder, edit):

@@ -113,6 +113,19 @@ def test_a_frames_intrinsics_come_before_the_files(capture_folder, edit):
     assert (second.camera.fx, second.camera.distortion[0]) == (20.0, 0.0)
 
 
+def test_a_frames_own_focal_length_or_distortion_replaces_the_files_in_either_form(capture_folder, edit):
+    def change(meta):
+        meta["distortion_params"] = [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]
+        meta["frames"][0].update(camera_angle_x=2 * np.arctan(0.5), k1=0.01)
+        meta["frames"][1].update(fl_x=30.0, fl_y=None)
+
+    edit(capture_folder / FILE, change)
+    first, second, third = (frame.camera for frame in load_capture(capture_folder).states[0].frames[:3])
+    assert (first.fx, first.fy, first.distortion[0]) == pytest.approx((16, 16, 0.01))
+    assert (second.fx, second.fy, second.distortion[0]) == (30, 30, 0.1)
+    assert (third.fx, third.fy, third.distortion[0]) == (20, 20, 0.1)
+
+
 def test_field_of_view_and_image_size_stand_in_for_missing_intrinsics(capture_folder, edit):
     def change(meta):
         for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):

@@ -110,6 +110,10 @@ def test_package_paths_are_found_above_the_urdf(tmp_path):
     # A package that was unpacked under another name.
     assert find_mesh("package://other_name/meshes/a.stl", folder / "crane.urdf") == mesh
     assert find_mesh("../meshes/a.stl", folder / "crane.urdf").resolve() == mesh
+    # One that has a file of the same path.
+    (tmp_path / "hook/meshes").mkdir(parents=True)
+    (tmp_path / "hook/meshes/a.stl").write_bytes(b"")
+    assert find_mesh("package://hook/meshes/a.stl", folder / "crane.urdf") == tmp_path / "hook/meshes/a.stl"
     with pytest.raises(InputError, match="crane_description has no meshes/b.stl; put that file there"):
         find_mesh("package://crane_description/meshes/b.stl", folder / "crane.urdf")
     with pytest.raises(InputError, match="put the package 'other_name' there"):
@@ -157,3 +161,14 @@ def test_an_unknown_shape_is_refused(tmp_path):
 def test_a_joint_that_is_not_there_is_answered_with_those_that_are(tmp_path):
     with pytest.raises(InputError, match="swing, wrist, hoist, follow"):
         read_urdf(write(tmp_path)).joint("elbow")
+
+
+def test_a_shape_without_any_extent_is_none(tmp_path):
+    robot = read_urdf(write(tmp_path, URDF.replace('<sphere radius="0.5"/>', '<sphere radius="0"/>')))
+    assert robot.surface(robot.parts()[4], {}) is None
+
+
+def test_a_mesh_that_is_scaled_flat_is_refused(tmp_path):
+    robot = read_urdf(write(tmp_path, URDF.replace('<sphere radius="0.5"/>', '<mesh filename="a.stl" scale="1 1 0"/>')))
+    with pytest.raises(InputError, match="<mesh scale='1 1 0'> makes the mesh flat"):
+        robot.surface(robot.parts()[4], {})

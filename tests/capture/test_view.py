@@ -94,6 +94,14 @@ def test_frames_without_labels_or_alpha_have_none(capture_folder, edit):
     torch.testing.assert_close(view.rgb_on(torch.zeros(3)), torch.full((16, 16, 3), 9 / 255))
 
 
+def test_an_image_whose_alpha_says_nothing_is_opaque(capture_folder, edit):
+    cv2.imwrite(str(capture_folder / "state_00/images/0000.png"), np.full((16, 16, 4), 255, np.uint8))
+    assert load_views(load_capture(capture_folder), 0)[0].alpha is None
+    cv2.imwrite(str(capture_folder / "state_00/o.png"), np.eye(16, dtype=np.uint8) * 255)
+    edit(capture_folder / FILE, lambda m: m["frames"][0].update(object_mask_path="o.png"))
+    assert (load_views(load_capture(capture_folder), 0)[0].alpha > 0).tolist() == np.eye(16, dtype=bool).tolist()
+
+
 def test_the_image_is_composited_on_a_background(capture_folder):
     view = load_views(load_capture(capture_folder), 0)[0]
     background = torch.tensor([0.0, 0.5, 1.0])

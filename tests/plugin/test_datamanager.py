@@ -3,6 +3,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -105,6 +106,25 @@ def test_seed_points_lie_inside_every_silhouette(capture_dir: Path) -> None:
         u, v = (seen @ view.K.T)[:, :2].T / seen[:, 2]
         inside = view.alpha[v.long().clamp(0, 63), u.long().clamp(0, 63)] > 0
         assert inside.float().mean() > 0.95
+
+
+def test_points_start_in_the_hull_whatever_cloud_there_is_and_whichever_silhouette_is_empty(
+    capture_dir: Path, tmp_path: Path
+) -> None:
+    def points(capture: Path) -> torch.Tensor:
+        return manage(capture, seed_gaussians=200).train_dataparser_outputs.metadata["points3D_xyz"]
+
+    alone = points(capture_dir)
+    capture = shutil.copytree(capture_dir, tmp_path / "capture")
+    trimesh.PointCloud(5 * np.eye(7, 3)).export(capture / "state_01/cloud.ply")
+    file = capture / "state_01/transforms.json"
+    meta = json.loads(file.read_text()) | {"ply_file_path": "cloud.ply"}
+    file.write_text(json.dumps(meta))
+    assert torch.equal(points(capture), alone)
+    image = capture / "state_01" / meta["frames"][0]["file_path"]
+    cv2.imwrite(str(image), np.zeros_like(cv2.imread(str(image), cv2.IMREAD_UNCHANGED)))
+    without = points(capture)
+    assert len(without) >= 200 and (without.amax(0) - alone.amax(0)).abs().max() < 0.1
 
 
 def test_normals_come_with_points_on_surfaces(capture_dir: Path, opaque_capture_dir: Path) -> None:

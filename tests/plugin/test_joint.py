@@ -1,5 +1,7 @@
 import copy
+import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -217,6 +219,26 @@ def test_poses_become_a_joint_a_bundle_and_a_slider(tmp_path: Path, capture_dir:
     centre = normal.means[normal.part_ids == 1].double().mean(0) / pipeline.datamanager.capture.normalization.scale
     expected = centre + torch.from_numpy(pipeline.datamanager.capture.normalization.centre)
     assert torch.allclose(pipeline.bundle.parts[0].splat.means.double().mean(0), expected, atol=1e-5)
+
+
+def test_joints_are_as_sure_where_the_worlds_origin_is_far_away(tmp_path: Path, capture_dir: Path) -> None:
+    far = shutil.copytree(capture_dir, tmp_path / "far")
+    for file in far.glob("state_*/transforms.json"):
+        meta = json.loads(file.read_text())
+        for frame in meta["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] += 1e5
+        file.write_text(json.dumps(meta))
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+    near, away = (
+        joint_pipeline(tmp_path / folder, capture, pose_state(), root="lid").bundle.joints[0]
+        for folder, capture in (("a", capture_dir), ("b", far))
+    )
+    assert (away.type, away.parent) == (near.type, near.parent)
+    torch.testing.assert_close(away.values, near.values, atol=1e-6, rtol=0)
+    torch.testing.assert_close(away.origin - 1e5, near.origin, atol=1e-5, rtol=0)
+    torch.testing.assert_close(away.covariance["values"], near.covariance["values"], rtol=1e-3, atol=0)
 
 
 def test_joints_of_a_part_that_may_have_turned_otherwise_are_ambiguous(tmp_path: Path, capture_dir: Path) -> None:

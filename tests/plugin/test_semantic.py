@@ -39,11 +39,17 @@ def test_gaussians_outside_the_silhouettes_fade(capture_dir, semantic_trainer):
     assert kept.float().mean() > 0.9
 
 
-@pytest.mark.parametrize("slack, stay", [(Slack(), False), (Slack(views=1), True)])
-def test_gaussians_that_a_view_loses_which_may_err_do_not_fade(capture_dir, semantic_trainer, slack, stay):
+@pytest.mark.parametrize(
+    ("slack", "shown", "stay"), [(Slack(), 255, False), (Slack(views=1), 255, True), (Slack(), 0, True)]
+)
+def test_gaussians_that_a_view_loses_which_may_err_or_shows_nothing_do_not_fade(
+    capture_dir, semantic_trainer, slack, shown, stay
+):
     pipeline = semantic_trainer(capture_dir).pipeline
     before = pipeline.model.opacities.detach().clone()
-    pipeline._views[0] = replace(pipeline._views[0], alpha=torch.zeros_like(pipeline._views[0].alpha))
+    alpha = torch.zeros_like(pipeline._views[0].alpha)
+    alpha[1, 1] = shown
+    pipeline._views[0] = replace(pipeline._views[0], alpha=alpha)
     pipeline._slack, pipeline.model.config.refine_every = slack, 4
     pipeline._keep_inside(4)
     assert ((pipeline.model.opacities == before).float().mean() > 0.9) == stay

@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from splatart_ns.geometry.se3 import se3_exp
-from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
+from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics, shifted
 from splatart_ns.stages.joint_fit import JointFit
 
 
@@ -111,3 +113,21 @@ def test_joints_of_more_freedom_take_their_values_side_by_side():
     by_name = forward_kinematics(tree, {"joint_1_3": [0.1, 0.2, 0.3]})
     assert torch.allclose(by_name[2], T[1, 2]) and torch.equal(by_name[1], torch.eye(4).double())
     assert torch.allclose(forward_kinematics(tree, 2 * q, clamp=True), T)
+
+
+def test_a_tree_in_a_shifted_world_moves_its_points_alike():
+    z, ball, free = torch.eye(3).double()[2], torch.zeros(2, 3).double(), torch.zeros(2, 6).double()
+    ball[1], free[1] = torch.tensor([0.3, -0.2, 0.5]), torch.tensor([0.1, 0.2, 0.3, 0.4, -0.5, 0.6])
+    joints = [replace(j, fit=replace(j.fit, values=j.fit.values[:2].double())) for j in tree().joints]
+    joints += [
+        Joint(4, 6, JointFit("spherical", z, torch.tensor([3.0, 1.0, 0.0]).double(), 0.0, ball, 0.0)),
+        Joint(4, 8, JointFit("free", z, torch.zeros(3).double(), 0.0, free, 0.0)),
+    ]
+    joints[0] = replace(joints[0], other=joints[1])
+    here = KinematicTree([2, 3, 4, 5, 6, 8, 9], 4, joints)
+    by = torch.tensor([100.0, -50.0, 7.0]).double()
+    there = shifted(here, by)
+    shift_there, back = (torch.from_numpy(shift(x)) for x in (by.numpy(), -by.numpy()))
+    expected = shift_there @ forward_kinematics(here, here.observed()) @ back
+    torch.testing.assert_close(forward_kinematics(there, there.observed()), expected)
+    torch.testing.assert_close(there.joints[0].other.fit.origin, joints[1].fit.origin + by)
