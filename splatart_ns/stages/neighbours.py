@@ -75,19 +75,23 @@ def _jointed(
     rest: Mapping[int, Tensor],
 ) -> InitialMotion:
     """Of a part's motion and those that look alike the first that a joint with a part makes that touches it, or rests:
-    its front may touch other drawers alone. The motion itself if none does; `fixed` and `rest` are motions [4, 4]."""
+    its front may touch other drawers alone. One that makes joints with several goes first: a hip moves against the body
+    and the leg. The motion itself if none makes any; `fixed` and `rest` are motions [4, 4]."""
 
-    def jointed(T: Tensor) -> bool:
-        return any(parts.may_be_jointed(part, q, inverse(T_q) @ T) for q, T_q in {**rest, **fixed}.items())
+    def joints(T: Tensor) -> int:
+        """With how much of what moves, and with what rests, which counts as one."""
+        against = {q: parts.may_be_jointed(part, q, inverse(T_q) @ T) for q, T_q in {**rest, **fixed}.items()}
+        return any(against[q] for q in rest) + sum(against[q] for q in fixed.keys() - rest.keys())
 
     choices = [motion.T, *motion.alike]
     if parts.turns_over(part, {**fixed, part: motion.T}):
         splat = splats[0].select(splats[0].part_ids == part)
         R, centroid = symmetric_turns(splat), splat.means.double().mean(0)
         turned = motion.T @ from_rotation_translation(R, centroid - R @ centroid)
-        turned = turned[[jointed(T) for T in turned]]
+        turned = turned[[joints(T) > 0 for T in turned]]
         choices += alike_in_even_light(splats, views, part, motion.T, turned)
-    best = next((i for i, T in enumerate(choices) if jointed(T)), 0)
+    made = [joints(T) for T in choices]
+    best = made.index(max(made))
     return replace(motion, T=choices[best], alike=tuple(T for i, T in enumerate(choices) if i != best))
 
 

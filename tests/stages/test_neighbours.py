@@ -173,3 +173,26 @@ def test_a_part_beside_others_in_doubt_waits_for_what_they_turn_out_to_do():
     found = turned_as_neighbours_let(states, tuple(photograph(s) for s in states), motions)
     assert torch.equal(found[2].T, first)
     assert angle_deg(found[3].T, second) < 1 and torch.equal(found[3].alike[0], over)
+
+
+def test_a_part_between_two_moves_against_both():
+    """A hip that may have turned by more or less against the body; the leg hangs on it."""
+    places = {1: 0.0, 2: 0.5, 3: 1.0, 4: 1.5}
+    body, hip, leg, foot = (box(part, (0.5, 0.2, 0.2), (x, 0.0, 0.0), num_parts=4) for part, x in places.items())
+
+    def turn(degrees, x):
+        return about(motion((0, 0, degrees), (0, 0, 0)), torch.tensor([x, 0.1, 0.0]).double())
+
+    right = turn(40, 0.25)
+    thigh = right @ about(motion((35, 0, 0), (0, 0, 0)), torch.tensor([0.75, 0.0, 0.0]).double())
+    shin = thigh @ turn(20, 1.25)
+    moved = [hip.transformed(right), leg.transformed(thigh), foot.transformed(shin)]
+    motions = {
+        1: RESTS,
+        2: InitialMotion(turn(80, 0.25), found=True, alike=(right,)),
+        3: InitialMotion(thigh, found=True),
+        4: InitialMotion(shin, found=True),
+    }
+    states = Splat.cat([body, hip, leg, foot]), Splat.cat([body, *moved])
+    found = turned_as_neighbours_let(states, ([], []), motions)
+    assert torch.equal(found[2].T, right) and torch.equal(found[3].T, thigh)
