@@ -13,6 +13,7 @@ from torch import Tensor
 
 from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.posing import moved_splat, normalized, observed_motions, part_features
+from splatart_ns.capture.annotations import write_mask_classes
 from splatart_ns.capture.capture import UNLABELLED, Camera, Capture, Frame, Normalization
 from splatart_ns.capture.images import read_image, read_sized, undistorted_points, write_png
 from splatart_ns.errors import InputError
@@ -74,8 +75,7 @@ def write_labels(
                 done.append(RenderedLabels(state.name, frame, doubtful))
         if not done:
             raise InputError(f"{capture.path}: every frame is labelled; there is nothing to add.")
-        rows = ["Pixel Value, Class", *(f"{i}, {name}" for i, name in capture.parts.items())]
-        (folder / "labels/_classes.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+        write_mask_classes(folder / "labels/_classes.csv", capture.parts)
     return sorted(done, key=lambda one: -one.doubtful)
 
 

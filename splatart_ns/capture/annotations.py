@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import re
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,9 @@ BACKGROUND_NAMES = ("background", "bg")
 UNLABELLED_NAMES = ("unlabelled", "unlabeled", "ignore", "void")
 """Classes of these names are no parts."""
 _CLASS_LISTS = ("classes.txt", "obj.names", "_darknet.labels")
+_MASK_CLASS_LISTS = (*_CLASS_LISTS, "_classes.csv", "labelmap.txt")
 _CLASS_YAMLS = ("data.yaml", "data.yml", "dataset.yaml")
+_NOT_COCO, _AS_COCO = "it is no COCO file", "export the labels as COCO segmentation"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 
@@ -57,8 +61,8 @@ def read_annotations(path: Path) -> Annotations:
     - Masks: PNGs of class ids in one channel, beside Roboflow's `_classes.csv` ("Pixel Value, Class"), or a
       `classes.txt` whose line numbers are the ids, from 0 if the first is "background", else from 1.
 
-    In COCO and YOLO an image without a shape is not labelled; later shapes cover earlier ones. Nothing outside the
-    folder is opened.
+    An image without a shape, or whose mask holds the background alone, is not labelled; later shapes cover earlier
+    ones. Nothing outside the folder is opened. Hidden files, and other JSON beside COCO files, are passed over.
 
     Raises `InputError` for anything else.
     """
@@ -72,22 +76,42 @@ def _read(path: Path) -> Annotations:
     if os.path.isfile(path):
         if zipfile.is_zipfile(path):
             raise CaptureError(path, "it is a zip", "unpack it first and give the folder")
+        if path.suffix.lower() in (".txt", ".yaml", ".yml"):
+            raise CaptureError(path, "it is one file of many", "give the folder that holds data.yaml or classes.txt")
+        if _is_json_list(path):
+            raise CaptureError(path, _NOT_COCO, _AS_COCO)
         return _read_coco(path.parent, path, read_json(path))
     if not path.is_dir():
         raise CaptureError(path, "there are no labels here", "give the file or the folder that the tool exported")
-    files = sorted(f for f in path.rglob("*") if os.path.isfile(f) and is_inside(path, f))
-    jsons = [(f, read_json(f)) for f in files if f.suffix == ".json"]
-    if coco := [(f, content) for f, content in jsons if "annotations" in content and "images" in content]:
+    files = sorted(
+        f for f in path.rglob("*") if not _is_hidden(f.relative_to(path)) and os.path.isfile(f) and is_inside(path, f)
+    )
+    jsons = [f for f in files if f.suffix == ".json"]
+    objects = [(f, read_json(f)) for f in jsons if not _is_json_list(f)]
+    if coco := [(f, content) for f, content in objects if "annotations" in content and "images" in content]:
         return _merged([_read_coco(path, f, content) for f, content in coco])
     if texts := _yolo_texts(path, files):
         return _read_yolo(path, files, texts)
-    if pngs := [f for f in files if f.suffix.lower() == ".png"]:
+    pngs = [f for f in files if f.suffix.lower() == ".png"]
+    if pngs and (not jsons or any(f.name in _MASK_CLASS_LISTS for f in files)):
         return _read_masks(path, files, pngs)
+    if jsons:
+        raise CaptureError(jsons[0], _NOT_COCO, _AS_COCO)
     raise CaptureError(
         path,
         "there are no labels here",
         "export them as COCO segmentation, as YOLO polygons with data.yaml, or as mask PNGs with _classes.csv",
     )
+
+
+def _is_hidden(path: Path) -> bool:
+    """Whether systems, and not tools, made a file: `.DS_Store`, macOS's `._x.json` and `__MACOSX/x.json`."""
+    return any(part.startswith(".") or part == "__MACOSX" for part in path.parts)
+
+
+def _is_json_list(file: Path) -> bool:
+    """Whether a file holds a JSON list, as Label Studio's own tasks do, which is no export that is read here."""
+    return read_text(file).lstrip().startswith("[")
 
 
 def _merged(exports: Sequence[Annotations]) -> Annotations:
@@ -107,7 +131,7 @@ def _read_coco(root: Path, file: Path, content: dict[str, Any]) -> Annotations:
     def objects(key: str) -> Iterator[dict[str, Any]]:
         values = content.get(key)
         if not isinstance(values, list):
-            raise CaptureError(file, f"{key} is {show(values)}", "export the labels as COCO segmentation")
+            raise CaptureError(file, f"{key} is {show(values)}", _AS_COCO)
         for i, value in enumerate(values):
             if not isinstance(value, dict):
                 raise CaptureError(file, f"{key}[{i}] is {show(value)}", "write it as an object")
@@ -211,11 +235,14 @@ def _is_yolo(file: Path) -> bool:
 
 
 def _read_yolo(path: Path, files: Sequence[Path], texts: Sequence[Path]) -> Annotations:
-    classes = _check_classes(path, _yolo_classes(path, files))
+    names = _yolo_classes(path, files)
+    numbers = [number for number, name in enumerate(names) if name]
+    classes = _check_classes(path, [names[number] for number in numbers])
+    place = {number: k for k, number in enumerate(numbers, start=1)}
     pictures = {f.with_suffix(""): f for f in files if f.suffix.lower() in IMAGE_SUFFIXES}
     images = []
     for file in texts:
-        shapes = list(_yolo_shapes(file, len(classes)))
+        shapes = list(_yolo_shapes(file, place))
         if shapes:
             # .../labels/train/x.txt belongs to .../images/train/x.jpg.
             name = file.relative_to(path).with_suffix("")
@@ -239,10 +266,11 @@ def _yolo_classes(path: Path, files: Sequence[Path]) -> list[str]:
 
 
 def _listed_classes(path: Path, files: Sequence[Path], wanted: str) -> list[str]:
+    """The names by their lines, "" where one is empty."""
     lists = [f for f in files if f.name in _CLASS_LISTS]
     if not lists:
         raise CaptureError(path, "the names of the classes are missing", f"put the export's {wanted} beside the labels")
-    return _the_one([(f, [line.strip() for line in read_text(f).splitlines() if line.strip()]) for f in lists])
+    return _the_one([(f, [line.strip() for line in read_text(f).rstrip().splitlines()]) for f in lists])
 
 
 def _the_one(found: Sequence[tuple[Path, Any]]) -> Any:
@@ -253,7 +281,7 @@ def _the_one(found: Sequence[tuple[Path, Any]]) -> Any:
     return found[0][1]
 
 
-def _yolo_shapes(file: Path, num_classes: int) -> Iterator[tuple[int, np.ndarray]]:
+def _yolo_shapes(file: Path, place: dict[int, int]) -> Iterator[tuple[int, np.ndarray]]:
     for i, line in enumerate(read_text(file).splitlines(), start=1):
         if not (words := line.split()):
             continue
@@ -262,12 +290,13 @@ def _yolo_shapes(file: Path, num_classes: int) -> Iterator[tuple[int, np.ndarray
             number = int(words[0])
         except ValueError:
             raise CaptureError(file, f"line {i} is {show(line)}", "write a class number and coordinates") from None
-        if not 0 <= number < num_classes:
-            raise CaptureError(file, f"line {i} has class {number} of {num_classes}", "add its name to the classes")
+        if number not in place:
+            found = f"line {i} has class {number}, which none of the {len(place)} classes is"
+            raise CaptureError(file, found, "add its name to the classes")
         corners = _corners(file, f"line {i}", numbers)
         if corners.min() < -0.01 or corners.max() > 1.01:
             raise CaptureError(file, f"line {i} has coordinates beyond 0 to 1", "divide them by width and height")
-        yield number + 1, corners
+        yield place[number], corners
 
 
 @dataclass(frozen=True)
@@ -287,16 +316,27 @@ class _YoloShapes:
 def _read_masks(path: Path, files: Sequence[Path], pngs: Sequence[Path]) -> Annotations:
     named = _mask_classes(path, files)
     marked = [f for f in pngs if f.stem.endswith("_mask")]  # Roboflow's, which lie beside the images
-    place = np.zeros(256, np.uint16)
+    place = np.zeros(max(UNLABELLED, *named) + 1, np.uint16)
     for k, value in enumerate(named, start=1):
         place[value] = k
+    background = [value for value, name in named.items() if name.lower() in BACKGROUND_NAMES]
+    with ThreadPoolExecutor() as pool:
+        blank = list(pool.map(lambda file: _is_blank(file, background), marked or pngs))
     images = []
-    for file in marked or pngs:
+    for file in (file for file, nothing in zip(marked or pngs, blank, strict=True) if not nothing):
         name = file.relative_to(path).as_posix()
         if marked:
             name = re.sub(r"_mask\.png$", ".png", name, flags=re.IGNORECASE)
         images.append(AnnotatedImage(file, name, image_size(file), _Mask(file, place, tuple(named))))
     return Annotations("masks", tuple(named.values()), tuple(images))
+
+
+def _is_blank(file: Path, background: Sequence[int]) -> bool:
+    """Whether a mask holds the background alone. One that cannot be read is no such mask: drawing it says why."""
+    try:
+        return bool(np.isin(read_labels(file), background).all())
+    except CaptureError:
+        return False
 
 
 def _mask_classes(path: Path, files: Sequence[Path]) -> dict[int, str]:
@@ -309,20 +349,41 @@ def _mask_classes(path: Path, files: Sequence[Path]) -> dict[int, str]:
         raise CaptureError(colours[0], found, "export the labels as COCO 1.0")
     else:
         names = _listed_classes(path, files, "_classes.csv or classes.txt")
-        named = dict(enumerate(names, start=0 if names[:1] and names[0].lower() in BACKGROUND_NAMES else 1))
+        start = 0 if names and names[0].lower() in BACKGROUND_NAMES else 1
+        named = {value: name for value, name in enumerate(names, start=start) if name}
     _check_classes(path, list(named.values()))
     return {0: BACKGROUND_NAMES[0], UNLABELLED: UNLABELLED_NAMES[0], **named}
 
 
 def _csv_classes(file: Path) -> dict[int, str]:
-    named = {}
-    for i, line in enumerate(read_text(file).splitlines()[1:], start=2):
-        if line.strip():
-            value, _, name = (word.strip() for word in line.partition(","))
-            if not re.fullmatch("[0-9]{1,3}", value) or int(value) > UNLABELLED or not name:
-                raise CaptureError(file, f"line {i} is {show(line)}", "write a pixel value and a class name")
-            named[int(value)] = name
+    """The names of the pixel values; the first line is a heading unless it begins with a number."""
+    named: dict[int, str] = {}
+    rows = _csv_rows(file)
+    for i, (value, *words) in rows[1:] if rows and not re.match("[-+.]?[0-9]", rows[0][1][0]) else rows:
+        name = ", ".join(word for word in words if word)
+        if not re.fullmatch("[0-9]{1,3}", value) or int(value) > UNLABELLED or not name:
+            raise CaptureError(file, f"line {i} is {show([value, *words])}", "write a pixel value and a class name")
+        if (other := named.setdefault(int(value), name)) != name:
+            found = f"the pixel value {int(value)} is {show(other)} and, in line {i}, {show(name)}"
+            raise CaptureError(file, found, "give every class a value of its own")
     return named
+
+
+def write_mask_classes(file: Path, names: Mapping[int, str]) -> None:
+    """Write the names of masks' pixel values as a `_classes.csv`."""
+    with file.open("w", encoding="utf-8", newline="") as opened:
+        csv.writer(opened, lineterminator="\n").writerows([("Pixel Value", "Class"), *names.items()])
+
+
+def _csv_rows(file: Path) -> list[tuple[int, list[str]]]:
+    """The lines that are not empty, each with its number."""
+    reader = csv.reader(read_text(file).splitlines(), skipinitialspace=True, strict=True)
+    try:
+        rows = [(reader.line_num, [word.strip() for word in row]) for row in reader]
+    except csv.Error as error:
+        found = f"line {reader.line_num} cannot be read ({error})"
+        raise CaptureError(file, found, "write a pixel value and a class name") from None
+    return [(i, row) for i, row in rows if any(row)]
 
 
 @dataclass(frozen=True)

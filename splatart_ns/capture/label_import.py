@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -22,11 +25,16 @@ from splatart_ns.capture.annotations import (
     read_annotations,
 )
 from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame, State
-from splatart_ns.capture.formats import TRANSFORMS, load_capture, load_states
+from splatart_ns.capture.formats import SPLITS, TRANSFORMS, load_capture, load_states
 from splatart_ns.capture.images import MAX_LABEL, write_png
-from splatart_ns.capture.values import DISTORTION, is_inside, read_json, relative_path
-from splatart_ns.errors import InputError
+from splatart_ns.capture.values import DISTORTION, is_inside, read_json, relative_path, show
+from splatart_ns.errors import InputError, printable
 from splatart_ns.files import new_folder, write_json
+
+FRAME_FILES = ("file_path", "semantics_path", "mask_path", "object_mask_path", "depth_file_path")
+"""Where a frame in a transforms.json names its files."""
+_QUERY = re.compile(rf"(?<=\.)({'|'.join(suffix[1:] for suffix in IMAGE_SUFFIXES)})[?#].*", re.IGNORECASE | re.DOTALL)
+"""What follows an image's name in an address."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +60,8 @@ def import_capture(sources: Sequence[Path], output_dir: Path, labels: Path | Non
         output_dir: a folder that does not exist yet, or is empty.
         labels: as `import_labels` takes them.
 
-    Links to folders, and links that leave a source, are not copied.
+    Links to folders, and links that leave a source, are not copied; absolute paths in a transforms.json become relative
+    ones.
 
     Raises:
         InputError: anything that cannot be read or written; labels that fit no frame, or not the frames' sizes.
@@ -65,7 +74,8 @@ def import_capture(sources: Sequence[Path], output_dir: Path, labels: Path | Non
         targets = [folder] if len(sources) == 1 else [folder / f"state_{k:02d}" for k in range(len(sources))]
         for source, target in zip(sources, targets, strict=True):
             _copy(source, target, output_dir)
-        return None if labels is None else import_labels(folder, labels)
+        with _errors_about({folder: output_dir, **dict(zip(targets, sources, strict=True))}):
+            return None if labels is None else import_labels(folder, labels)
 
 
 def import_labels(path: Path, labels: Path) -> LabelImport:
@@ -76,7 +86,7 @@ def import_labels(path: Path, labels: Path) -> LabelImport:
     `state_00_0001_jpg.rf.<hash>.jpg`, Label Studio's `<hash>-state_00_0001.jpg` to `state_00/images/0001.jpg`); where
     states have frames of one stem, a folder of the export named after the state tells them apart. The classes that the
     capture declares keep their ids, others follow in the export's order. Frames that the export does not label stay as
-    they are.
+    they are; where their labels' parts have no names, new classes are refused.
 
     Raises:
         InputError: anything that cannot be read or written; labels that fit no frame, or not the frames' sizes.
@@ -85,15 +95,23 @@ def import_labels(path: Path, labels: Path) -> LabelImport:
     annotations = read_annotations(labels)
     matches, unmatched = _match(capture, labels, annotations)
     metas = _metas(capture)
-    parts = next((meta["semantic_classes"][1:] for meta in metas.values() if meta.get("semantic_classes")), [])
+    declared = next((meta["semantic_classes"][1:] for meta in metas.values() if meta.get("semantic_classes")), [])
+    labelled = {match.frame.image for match in matches}
+    frames = [frame for state in capture.states for frame in state.frames]
+    kept = next((f.labels for f in frames if f.labels is not None and f.image not in labelled), None)
+    parts = declared or ([] if kept is None else list(capture.parts.values()))
     ids = _part_ids(labels, parts, annotations.classes)
+    if kept is not None and not declared and capture.parts and len(parts) > len(capture.parts):
+        found = f"its parts have no names, so {show(parts[len(capture.parts)])} of the export may be one of them"
+        mend = 'list "background" and the parts in semantic_classes, or export the labels of all frames'
+        raise CaptureError(kept, found, mend)
 
     def draw(match: _Match) -> np.ndarray:
         camera, image = match.frame.camera, match.image
         drawn = image.draw(camera.width, camera.height)
         return ids[drawn]
 
-    taken: set[Path] = set()
+    taken = _files_that_stay(path, metas, labelled)
     for match in matches:
         match.file = _label_file(match.root, match.frame, taken)
         if not is_inside(path, match.file):
@@ -114,10 +132,22 @@ def import_labels(path: Path, labels: Path) -> LabelImport:
     return LabelImport(
         format=annotations.format,
         labelled=len(matches),
-        frames=sum(len(state.frames) for state in capture.states),
+        frames=len(frames),
         parts=tuple(parts),
         unmatched=tuple(unmatched),
     )
+
+
+@contextmanager
+def _errors_about(sources: dict[Path, Path]) -> Iterator[None]:
+    """Let errors about copies name what they are copies of."""
+    try:
+        yield
+    except InputError as error:
+        message = str(error)
+        for copy, source in sorted(sources.items(), reverse=True):  # what lies in a folder before the folder
+            message = message.replace(printable(str(copy)), printable(str(source)))
+        raise InputError(message) from None
 
 
 def _copy(source: Path, target: Path, output_dir: Path) -> None:
@@ -133,6 +163,41 @@ def _copy(source: Path, target: Path, output_dir: Path) -> None:
         shutil.copytree(source, target, ignore=left_out, dirs_exist_ok=True)
     except shutil.Error as error:
         raise InputError(f"{error.args[0][0][0]}: cannot be copied; make it readable, and room on the disk.") from None
+    for file in sorted(target.rglob("transforms*.json")):
+        _name_own_files(file, source, target)
+
+
+def _name_own_files(file: Path, source: Path, target: Path) -> None:
+    """Let a transforms.json of a copy name the copy's files where it leads to the source's: by absolute paths, or by
+    relative ones that leave the source and come back."""
+    folder = file.parent.relative_to(target)
+
+    def own(value: Any) -> Any:
+        if not isinstance(value, str) or not os.path.normpath(folder / value).startswith(("/", "..")):
+            return value
+        path = source / folder / value
+        if not is_inside(source, path):
+            return value
+        root = os.path.realpath(source)
+        places = [Path(os.path.realpath(path.parent), path.name), Path(os.path.realpath(path))]
+        place = next(place for place in places if place.is_relative_to(root))
+        return Path(os.path.relpath(place.relative_to(root), folder)).as_posix()
+
+    try:
+        meta = read_json(file)
+    except CaptureError:  # it belongs to no state: those have been read
+        return
+    entries = meta.get("frames")
+    named = [(entry, FRAME_FILES) for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
+    changed = False
+    for values, keys in [*named, (meta, ("ply_file_path", *(f"{split}_filenames" for split in SPLITS)))]:
+        for key in keys:
+            value = values.get(key)
+            new = [own(each) for each in value] if isinstance(value, list) else own(value)
+            if new != value:
+                values[key], changed = new, True
+    if changed:
+        write_json(file, meta)
 
 
 # ---------------------------------------------------------------------------------------------- frames and classes
@@ -208,8 +273,12 @@ def _key(name: str) -> str:
 
 
 def _exported_path(name: str) -> PurePosixPath:
-    """The path of an exported image without what tools append: `a/x_jpg.rf.<hash>.jpg` is `a/x`."""
-    path = PurePosixPath(name)
+    """The path of an exported image without what tools append: `a/x_jpg.rf.<hash>.jpg`, `a\\x.jpg` and
+    `http://a/x.jpg?token=...` are `a/x`."""
+    name = _QUERY.sub(r"\1", name)
+    if re.search("[a-z]{2,}:/", name):
+        name = unquote(name)
+    path = PurePosixPath(name.replace("\\", "/"))
     if path.suffix.lower() in IMAGE_SUFFIXES:
         path = path.with_suffix("")
     if found := re.fullmatch(r"(.+?)(_(png|jpe?g|webp|bmp|tiff?))?\.rf\.\w+", path.name, flags=re.IGNORECASE):
@@ -277,12 +346,22 @@ def _transforms(capture: Capture) -> dict[str, Any]:
     return {"camera_model": "OPENCV", **lists, "frames": frames}
 
 
-def _label_file(root: Path, frame: Frame, taken: set[Path]) -> Path:
-    """semantics/0001.png for images/0001.jpg; no two frames get the same."""
+def _files_that_stay(root: Path, metas: dict[Path, dict[str, Any]], labelled: set[Path]) -> set[str]:
+    """The files of all frames, all links followed, but the labels of the images that get new ones."""
+    used = []
+    for file, meta in metas.items():
+        for entry in meta["frames"]:
+            new = file.parent / relative_path(file, "file_path", entry.get("file_path")) in labelled
+            values = [entry.get(key) for key in FRAME_FILES if not (new and key == "semantics_path")]
+            used += [file.parent / value for value in values if isinstance(value, str)]
+    return {os.path.realpath(file) for file in used if is_inside(root, file)}
+
+
+def _label_file(root: Path, frame: Frame, taken: set[str]) -> Path:
+    """semantics/0001.png for images/0001.jpg, or another name where this is `taken`, which it joins."""
     parts = [part for part in Path(os.path.relpath(frame.image, root)).parts if part != ".."]
     name = PurePosixPath(*(parts[1:] if len(parts) > 1 and parts[0] == "images" else parts))
-    file = root / "semantics" / name.with_suffix(".png")
-    if file in taken:
-        file = root / "semantics" / f"{name}.png"
-    taken.add(file)
+    names = chain([name.with_suffix(".png"), f"{name}.png"], (f"{name}.{n}.png" for n in count(2)))
+    file = next(f for f in (root / "semantics" / n for n in names) if os.path.realpath(f) not in taken)
+    taken.add(os.path.realpath(file))
     return file

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from splatart_ns.capture.annotations import write_mask_classes
 from splatart_ns.capture.capture import Capture, CaptureError, Frame, State
 from splatart_ns.capture.images import MAX_LABEL, read_image, read_sized, write_png
 from splatart_ns.capture.values import parse_number, read_json, show
@@ -60,8 +61,7 @@ def segment(capture: Capture, prompts: Path, output: Path, segmenter: Segmenter)
             labels = np.where(logits.max(axis=0) > 0, ids[logits.argmax(axis=0)], np.uint8(0))
             inner = [part for part in PurePosixPath(frame.name).parts if part not in ("..", "/")]
             write_png(folder / PurePosixPath(state.name, *inner).with_suffix(".png"), labels)
-        rows = ["Pixel Value, Class", *(f"{i}, {name}" for i, name in enumerate(names, start=1))]
-        (folder / "_classes.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+        write_mask_classes(folder / "_classes.csv", dict(enumerate(names, start=1)))
     return len(wanted)
 
 

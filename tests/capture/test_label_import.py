@@ -134,6 +134,34 @@ def test_folders_of_single_states_become_one_capture(capture_folder, tmp_path):
     assert check_capture(tmp_path / "new") == []
 
 
+def test_a_copy_names_its_own_files_where_the_source_names_them_by_absolute_paths(capture_folder, tmp_path, edit):
+    def absolute(meta):
+        for e in meta["frames"][:4]:
+            e.update(file_path=f"{state}/{e['file_path']}", semantics_path=f"{state}/{e['semantics_path']}")
+        meta["frames"][4]["semantics_path"] = f"../{state.name}/labels/0004.png"
+        meta["train_filenames"] = [e["file_path"] for e in meta["frames"][:6]]
+
+    truth = all_labels(capture_folder)
+    for state in sorted(capture_folder.iterdir()):
+        edit(state / "transforms.json", absolute)
+    import_capture(sorted(capture_folder.iterdir()), tmp_path / "states")
+    import_capture([capture_folder], tmp_path / "whole", write_export(capture_folder, tmp_path))
+    shutil.rmtree(capture_folder)
+    assert all_labels(tmp_path / "states") == all_labels(tmp_path / "whole") == truth
+
+
+def test_errors_about_a_copy_name_its_source(capture_folder, tmp_path, edit):
+    export = write_masks(load_capture(capture_folder), tmp_path / "export", flat_name)
+    (export / "train/state_00_0003_mask.png").unlink()
+    states = [capture_folder / "state_01", capture_folder / "state_00"]
+    for state in states:
+        edit(state / "transforms.json", lambda meta: meta.pop("semantic_classes"))
+    for sources, state in (([capture_folder], "state_00"), (states, "state_01")):
+        with pytest.raises(InputError) as error:
+            import_capture(sources, tmp_path / "new", export)
+        assert str(error.value).startswith(f"{capture_folder}/{state}/labels/0003.png: its parts have no names")
+
+
 def test_labels_go_into_the_capture_itself_only_on_request(capture_folder, tmp_path):
     truth = all_labels(capture_folder)
     export = write_coco(load_capture(capture_folder), tmp_path / "labels.json", "polygons")
@@ -162,6 +190,55 @@ def test_declared_parts_keep_their_ids_and_new_ones_follow(capture_folder, tmp_p
     capture = load_capture(capture_folder)
     assert capture.parts == {1: "base", 2: "door", 3: "handle"}
     assert set(np.unique(read_labels(capture.states[0].frames[0].labels))) == {0, 2, 3}
+
+
+def test_new_classes_beside_old_labels_without_names_are_refused(capture_folder, tmp_path, edit):
+    export = write_masks(load_capture(capture_folder), tmp_path / "export", flat_name)
+    for state in ("state_00", "state_01"):
+        edit(capture_folder / state / "transforms.json", lambda meta: meta.pop("semantic_classes"))
+    assert import_labels(shutil.copytree(capture_folder, tmp_path / "all"), export).parts == ("base", "door")
+    (export / "train/state_00_0003_mask.png").unlink()
+    with pytest.raises(InputError, match=r"labels/0003\.png: its parts have no names, so 'base' of the"):
+        import_labels(capture_folder, export)
+    (export / "train/_classes.csv").write_text("1, part_2\n2, part_1\n")
+    assert import_labels(capture_folder, export).parts == ("part_1", "part_2")
+
+
+def test_files_of_frames_that_are_not_labelled_are_not_overwritten(capture_folder, tmp_path, edit):
+    def other_frames_files(meta):
+        meta["frames"][0]["semantics_path"] = "semantics/0001.png"
+        meta["frames"][2]["object_mask_path"] = "./semantics/0001.png.png"
+
+    export = write_masks(load_capture(capture_folder), tmp_path / "export", flat_name)
+    for file in set(export.glob("train/*_mask.png")) - {export / "train/state_00_0001_mask.png"}:
+        file.unlink()
+    state = capture_folder / "state_00"
+    edit(state / "transforms.json", other_frames_files)
+    (state / "semantics").mkdir()
+    for name in ("0001.png", "0001.png.png"):
+        cv2.imwrite(str(state / "semantics" / name), np.full((16, 16), 2, np.uint8))
+    assert import_labels(capture_folder, export).labelled == 1
+    frames = load_capture(capture_folder).states[0].frames
+    assert np.unique(read_labels(frames[0].labels)).tolist() == [2]
+    assert np.unique(read_labels(frames[2].object_mask)).tolist() == [2]
+    assert np.unique(read_labels(frames[1].labels)).tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        r"images\1a2b3c4d-state_00_0000.png",
+        r"C:\data\state_00_0000.png",
+        r"C:\data\state_00\images\0000.png",
+        "https://host/data/state_00_0000.png?token=a/b.c",
+        "https://host/o/my%20images%2Fstate_00%2F0000.PNG?alt=media#a",
+    ],
+)
+def test_images_are_known_by_windows_paths_and_addresses(capture_folder, tmp_path, edit, name):
+    export = write_coco(load_capture(capture_folder), tmp_path / "export/a/labels.json", "runs")
+    edit(export, lambda e: e["images"][0].update(file_name=name))
+    done = import_labels(capture_folder, tmp_path / "export")
+    assert (done.labelled, done.unmatched) == (16, ())
 
 
 @pytest.mark.parametrize("name", ["1a2b3c4d-", "1a2b3c4d-.", "..rf.x", "."])
@@ -195,6 +272,41 @@ def test_polygons_need_no_data_yaml_to_be_known(capture_folder, tmp_path):
     (export / "classes.txt").write_text("base\ndoor\nignore\n")
     (export / "train/labels").rename(export / "texts")
     assert import_labels(capture_folder, export).format == "YOLO"
+
+
+def test_other_files_beside_coco_are_passed_over(capture_folder, tmp_path):
+    export = tmp_path / "export"
+    write_coco(load_capture(capture_folder), export / "result.json", "runs")
+    (export / "__MACOSX").mkdir()
+    for name in ("._result.json", "__MACOSX/result.json", ".cache.txt"):
+        (export / name).write_bytes(b"\0\5\x16\7\xff")
+    (export / "tasks.json").write_text('[{"id": 1, "annotations": []}]')
+    (export / "notes.json").write_text('{"version": 3}')
+    assert import_labels(capture_folder, export).labelled == 16
+
+
+@pytest.mark.parametrize("content", ["[1]", '{"version": 3}'])
+def test_json_that_is_not_coco_is_to_be_exported_as_coco(capture_folder, tmp_path, content):
+    (tmp_path / "export").mkdir()
+    (tmp_path / "export/tasks.json").write_text(content)
+    cv2.imwrite(str(tmp_path / "export/state_00_0000.png"), np.zeros((16, 16), np.uint8))
+    for export in (tmp_path / "export", tmp_path / "export/tasks.json"):
+        with pytest.raises(InputError, match=r"tasks\.json: .*; export the labels as COCO segmentation"):
+            import_labels(capture_folder, export)
+
+
+def test_line_numbers_of_a_list_of_classes_stay_where_lines_are_empty(capture_folder, tmp_path):
+    truth = all_labels(capture_folder)
+    export = write_yolo(load_capture(capture_folder), tmp_path / "export")
+    (export / "data.yaml").unlink()
+    (export / "classes.txt").write_text("base\n\ndoor\n\n")
+    with pytest.raises(InputError, match=r"has class 1, which none of the 2 classes is; add its name"):
+        import_labels(capture_folder, export)
+    for file in export.glob("train/labels/*.txt"):
+        file.write_text(file.read_text().replace("\n1 ", "\n2 "))
+    without_labels(capture_folder)
+    assert import_labels(capture_folder, export).parts == ("base", "door")
+    assert all_labels(capture_folder) == truth
 
 
 @pytest.mark.parametrize("categories", [{}, {"categories": []}])
@@ -236,6 +348,10 @@ def zipped(capture, folder):
     return Path(shutil.make_archive(folder, "zip", folder)).replace(folder / "labels.zip")
 
 
+def one_text(capture, folder):
+    return min(write_yolo(capture, folder).glob("train/labels/*.txt"))
+
+
 def segmentation_mask(capture, folder):
     """As CVAT writes it."""
     write_masks(capture, folder, flat_name)
@@ -271,10 +387,11 @@ BAD_EXPORTS = {
     "YOLO boxes": (change_text("train/labels/*0003.txt", "0 0.5 0.5 0.1 0.1"), "a box is no polygon"),
     "YOLO pixels": (change_text("train/labels/*0003.txt", "0 5 5 9 9 5 9"), "divide them"),
     "YOLO words": (change_text("train/labels/*0003.txt", "door 0.5 0.5 0.1 0.1"), "line 1 is 'door"),
-    "YOLO class": (change_text("train/labels/*0003.txt", "7 0.1 0.1 0.2 0.1 0.2 0.2"), "class 7 of 3"),
+    "YOLO class": (change_text("train/labels/*0003.txt", "7 0.1 0.1 0.2 0.1 0.2 0.2"), "class 7, which none of"),
     "YOLO without NaN": (change_text("train/labels/*0003.txt", "0 nan 0.1 0.2 0.1 0.2 0.2"), "nan"),
     "YAML with code": (change_text("data.yaml", "names: !!python/object/apply:os.getcwd []"), "not YAML"),
     "YAML without names": (change_text("data.yaml", "names: 3"), "names is 3"),
+    "one text": (one_text, "give the folder that holds data.yaml or classes.txt"),
     "zip": (zipped, "it is a zip; unpack it first"),
     "masks of colours": (segmentation_mask, "export the labels as COCO 1.0"),
     "nothing": (lambda c, folder: folder, "there are no labels here"),
@@ -299,8 +416,34 @@ def test_masks_need_classes_for_all_their_values(capture_folder, tmp_path):
     (export / "train/_classes.csv").unlink()
     with pytest.raises(InputError, match="the names of the classes are missing"):
         import_labels(capture_folder, export)
+    (export / "classes.txt").write_text("base\n\ndoor\n")
+    with pytest.raises(InputError, match=r"_mask\.png: no class has the value 2"):
+        import_labels(capture_folder, export)
     (export / "classes.txt").write_text("base\ndoor\n")
     assert import_labels(capture_folder, export).parts == ("base", "door")
+
+
+def test_a_list_of_mask_classes_may_quote_names_and_lack_a_heading(capture_folder, tmp_path):
+    export = write_masks(load_capture(capture_folder), tmp_path / "export", flat_name)
+    without_labels(capture_folder)
+    (export / "train/_classes.csv").write_text('1,"lid, upper"\n"0", "background"\n2,"door"\n')
+    assert import_labels(capture_folder, export).parts == ("lid, upper", "door")
+
+
+def test_two_classes_of_one_pixel_value_are_refused(capture_folder, tmp_path):
+    export = write_masks(load_capture(capture_folder), tmp_path / "export", flat_name)
+    (export / "train/_classes.csv").write_text("Pixel Value, Class\n1, base\n2, lid\n2, door\n")
+    with pytest.raises(InputError, match=r"_classes\.csv: the pixel value 2 is 'lid' and, in line 4, 'door'"):
+        import_labels(capture_folder, export)
+
+
+def test_masks_of_background_alone_leave_their_frames_unlabelled(capture_folder, tmp_path):
+    export = write_masks(load_capture(capture_folder), tmp_path / "export", flat_name)
+    for file in sorted(export.glob("train/state_0?_000[3-7]_mask.png")):
+        cv2.imwrite(str(file), np.zeros((16, 16), np.uint8))
+    without_labels(capture_folder)
+    assert import_labels(capture_folder, export).labelled == 6
+    assert len(all_labels(capture_folder)) == 6
 
 
 def test_links_out_of_a_source_are_not_followed(capture_folder, tmp_path):
