@@ -67,12 +67,14 @@ def read_labels(path: Path) -> np.ndarray:
 
 def read_mask(path: Path) -> np.ndarray:
     """A silhouette or a mask, uint8 [H, W], 0 outside and 255 inside; masks of 0 and 1 are stretched to 0 and 255."""
-    mask = _to_bytes(path, _decode(path, read_bytes(path)))
+    mask = _decode(path, read_bytes(path))
+    if mask.dtype != np.uint16 or mask.max(initial=0) > 1:
+        mask = _to_bytes(path, mask)
     if mask.ndim == 3:
         if not (mask[..., :1] == mask[..., :3]).all():
             raise CaptureError(path, "the mask is a colour image", "save it with one grey channel")
         mask = np.ascontiguousarray(mask[..., 0])
-    return mask * np.uint8(255) if mask.max(initial=0) <= 1 else mask
+    return (mask * 255).astype(np.uint8) if mask.max(initial=0) <= 1 else mask
 
 
 def read_depth(path: Path, unit: float = 1e-3) -> np.ndarray:

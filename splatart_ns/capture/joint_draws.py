@@ -85,4 +85,5 @@ def _spread_values(joint: Joint, robot: Robot, count: int, rng: np.random.Genera
         middle = rng.uniform(low + 0.5 * _TURN, high - 0.5 * _TURN)
         low, high = middle - 0.5 * _TURN, middle + 0.5 * _TURN
     places = (rng.permutation(count) + rng.uniform(0.3, 0.7, count)) / count
-    return np.round(low + (high - low) * places, 4).clip(low, high)
+    digits = 4 if high - low > 1e-2 else 3 - math.floor(math.log10(max(high - low, 1e-12)))
+    return np.round(low + (high - low) * places, digits).clip(low, high)

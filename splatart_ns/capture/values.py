@@ -153,8 +153,8 @@ def parse_camera(file: Path, owner: str, values: dict[str, Any], image: Path) ->
             raise CaptureError(file, f"{angle_key} of {owner} is {angle:g}", "give the field of view in radians")
         return size / 2 / math.tan(angle / 2)
 
-    model = values.get("camera_model", "OPENCV")
-    if model not in PINHOLE_MODELS:
+    model = values.get("camera_model") or "OPENCV"
+    if str(model).upper() not in PINHOLE_MODELS:
         raise CaptureError(
             file,
             f"camera_model of {owner} is {show(model)}",

@@ -126,6 +126,13 @@ def test_a_frames_own_focal_length_or_distortion_replaces_the_files_in_either_fo
     assert (third.fx, third.fy, third.distortion[0]) == (20, 20, 0.1)
 
 
+@pytest.mark.parametrize("model", ["opencv", "Pinhole", None])
+def test_a_camera_model_may_be_spelled_otherwise_or_be_missing(capture_folder, edit, model):
+    expected = load_capture(capture_folder).states[0].frames[0].camera
+    edit(capture_folder / FILE, lambda m: m.update(camera_model=model))
+    assert load_capture(capture_folder).states[0].frames[0].camera == expected
+
+
 def test_field_of_view_and_image_size_stand_in_for_missing_intrinsics(capture_folder, edit):
     def change(meta):
         for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):

@@ -99,6 +99,8 @@ def test_coloured_palette_lossy_and_one_bit_labels_are_input_errors(tmp_path):
 def test_masks_of_zero_and_one_are_stretched(tmp_path):
     binary = np.array([[0, 1]], np.uint8)
     assert read_mask(write(tmp_path / "a.png", binary)).tolist() == [[0, 255]]
+    assert read_mask(write(tmp_path / "d.png", binary.astype(np.uint16))).tolist() == [[0, 255]]
+    assert read_mask(write(tmp_path / "e.png", binary.astype(np.uint16) * 65535)).tolist() == [[0, 255]]
     assert read_mask(write(tmp_path / "b.png", np.array([[0, 90]], np.uint8))).tolist() == [[0, 90]]
     assert read_mask(write(tmp_path / "c.png", np.repeat(binary[..., None] * 255, 3, axis=2))).tolist() == [[0, 255]]
 

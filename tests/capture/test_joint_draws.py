@@ -54,6 +54,17 @@ def test_parts_do_not_reach_into_each_other(walker, states, monkeypatch):
     assert sum(crossing(*walker, configurations) > 0 for configurations in at_once) >= 6
 
 
+def test_a_joint_of_a_tiny_range_moves_too(tmp_path):
+    box = '<visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual>'
+    slide = (
+        '<joint name="slide" type="prismatic"><parent link="a"/><child link="b"/><origin xyz="0 0 0.3"/>'
+        '<axis xyz="0 0 1"/><limit lower="0" upper="5e-5" effort="1" velocity="1"/></joint>'
+    )
+    tiny = robot_of(tmp_path, [f'<link name="a">{box}</link>', f'<link name="b">{box}</link>', slide])
+    first, second = draw_configurations(*args(tiny), 2, 0)
+    assert 1e-5 < abs(first["slide"] - second["slide"]) < 5e-5
+
+
 def test_every_joint_moves_within_its_limits(walker):
     first, second = draw_configurations(*args(walker), 2, 0)
     assert len(first) == 12 and all(abs(first[name] - second[name]) > 0.3 for name in first)
