@@ -100,7 +100,7 @@ class ArticulatedSplat:
         try:
             self.device = torch.device(device or default_device())
             torch.empty(0, device=self.device)
-        except (RuntimeError, AssertionError, NotImplementedError) as error:
+        except (RuntimeError, AssertionError) as error:  # of a torch without CUDA the second
             raise InputError(f"the device '{device}' cannot be used ({_first_line(error)}); give 'cpu'") from error
         parts = [replace(part, splat=part.splat.to(self.device)) for part in bundle.parts]
         self._on_device = replace(bundle, parts=parts)

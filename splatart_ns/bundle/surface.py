@@ -108,7 +108,7 @@ def part_surface(
     if len(splat) == 0:
         raise InputError("a part has no visible Gaussians, and so no surface: fit the object again")
     clear = splat.opacities > _FAINT
-    splat = without_strays(splat.select(clear) if clear.any() else splat)
+    splat = _without_strays(splat.select(clear) if clear.any() else splat)
     ends = _ellipsoid_ends(splat)
     centre, half = _box(ends)
     radius = float(half.norm())
@@ -150,7 +150,7 @@ def part_surface(
     return mesh
 
 
-def without_strays(splat: Splat) -> Splat:
+def _without_strays(splat: Splat) -> Splat:
     """A splat without Gaussians far from all others: few, apart by as much as most lie from the middle.
 
     One of them would make the part's box large and its voxels coarse.
