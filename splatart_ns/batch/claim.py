@@ -100,7 +100,7 @@ class Session:
         while not self._ended.wait(_BEAT):
             try:
                 self._beat()
-            except OSError:  # a store that does not answer may do so the next time
+            except (OSError, InputError):  # a store that does not answer may do so the next time
                 continue
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -152,7 +153,10 @@ class Folder:
 
 @dataclass(frozen=True)
 class ObjectStore:
-    """A URL of fsspec. Object stores show a file when all of it has arrived."""
+    """A URL of fsspec. Object stores show a file when all of it has arrived.
+
+    Raises InputError where the store does not answer: no bucket, no credentials, no network.
+    """
 
     url: str
 
@@ -168,13 +172,26 @@ class ObjectStore:
     def _at(self, path: str) -> str:
         return f"{self.url}/{path}" if path else self.url
 
-    def files(self, path: str) -> dict[str, FileInfo]:
-        top = self._fs._strip_protocol(self._at(path))
-        self._fs.invalidate_cache()
+    @contextmanager
+    def _answer(self) -> Iterator[None]:
+        """Turn what the stores' libraries raise, of many types, into an `InputError`."""
         try:
-            found = self._fs.find(top, detail=True)
-        except FileNotFoundError:
-            return {}
+            yield
+        except InputError:
+            raise
+        except Exception as error:
+            found = " ".join(str(error).split()) or type(error).__name__
+            mend = "correct the URL, or give this machine the credentials and the network that it needs"
+            raise InputError(f"{self.url}: cannot be read or written ({found}); {mend}.") from error
+
+    def files(self, path: str) -> dict[str, FileInfo]:
+        with self._answer():
+            top = self._fs._strip_protocol(self._at(path))
+            self._fs.invalidate_cache()
+            try:
+                found = self._fs.find(top, detail=True)
+            except FileNotFoundError:
+                return {}
         return {
             name[len(top) :].lstrip("/"): FileInfo(info["size"], _stamp(info))
             for name, info in found.items()
@@ -182,36 +199,41 @@ class ObjectStore:
         }
 
     def children(self, path: str) -> tuple[list[str], list[str]]:
-        try:
-            entries = self._fs.ls(self._at(path), detail=True)
-        except FileNotFoundError:
-            return [], []
+        with self._answer():
+            try:
+                entries = self._fs.ls(self._at(path), detail=True)
+            except FileNotFoundError:
+                return [], []
         names: dict[str, list[str]] = {"directory": [], "file": []}
         for entry in entries:
             names[entry["type"]].append(entry["name"].rstrip("/").rsplit("/", 1)[-1])
         return names["directory"], names["file"]
 
     def read(self, path: str) -> bytes | None:
-        try:
-            return self._fs.cat_file(self._at(path))
-        except FileNotFoundError:
-            return None
+        with self._answer():
+            try:
+                return self._fs.cat_file(self._at(path))
+            except FileNotFoundError:
+                return None
 
     def write(self, path: str, data: bytes) -> None:
-        self._fs.pipe_file(self._at(path), data)
+        with self._answer():
+            self._fs.pipe_file(self._at(path), data)
 
     def create(self, path: str, data: bytes) -> bool:
-        try:
-            self._fs.pipe_file(self._at(path), data, mode="create")
-        except FileExistsError:
-            return False
+        with self._answer():
+            try:
+                self._fs.pipe_file(self._at(path), data, mode="create")
+            except FileExistsError:
+                return False
         return True
 
     def remove(self, path: str) -> None:
-        try:
-            self._fs.rm_file(self._at(path))
-        except FileNotFoundError:
-            return
+        with self._answer():
+            try:
+                self._fs.rm_file(self._at(path))
+            except FileNotFoundError:
+                return
 
     def get(self, path: str, folder: Path) -> None:
         for name in self.files(path):
@@ -220,10 +242,12 @@ class ObjectStore:
             if not os.path.realpath(target).startswith(os.path.realpath(folder) + os.sep):
                 raise InputError(f"{self._at(path)}/{name}: leads out of its folder; rename it.")
             target.parent.mkdir(parents=True, exist_ok=True)
-            self._fs.get_file(f"{self._at(path)}/{name}", str(target))
+            with self._answer():
+                self._fs.get_file(f"{self._at(path)}/{name}", str(target))
 
     def put(self, file: Path, path: str) -> None:
-        self._fs.put_file(str(file), self._at(path))
+        with self._answer():
+            self._fs.put_file(str(file), self._at(path))
 
 
 def _is_file(entry: os.DirEntry) -> bool:

@@ -96,3 +96,33 @@ def test_a_link_in_a_folder_cannot_lead_out(tmp_path, link):
 def test_an_unknown_kind_of_url_is_a_mistake():
     with pytest.raises(InputError, match="nothing://"):
         open_storage("nothing://bucket").read("a")
+
+
+def test_a_store_that_does_not_answer_is_a_mistake(object_store, tmp_path):
+    (tmp_path / "file").write_text("one")
+    nowhere = open_storage("s3://no-such-bucket/a")
+    assert (nowhere.read("b"), nowhere.files(""), nowhere.children("")) == (None, {}, ([], []))
+    for write in (
+        lambda: nowhere.write("b", b"one"),
+        lambda: nowhere.create("b", b"one"),
+        lambda: nowhere.put(tmp_path / "file", "b"),
+    ):
+        with pytest.raises(InputError, match="s3://no-such-bucket/a: .*does not exist.*correct the URL"):
+            write()
+    misnamed = open_storage("s3://no!bucket/a")
+    for read in (misnamed.read, misnamed.files, misnamed.children, misnamed.remove):
+        with pytest.raises(InputError, match="s3://no!bucket/a: .*Invalid bucket name"):
+            read("b")
+
+
+def test_a_store_without_credentials_asks_for_them(object_store, monkeypatch, tmp_path):
+    import fsspec
+
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    for name in ("AWS_CONFIG_FILE", "AWS_SHARED_CREDENTIALS_FILE"):
+        monkeypatch.setenv(name, str(tmp_path / "none"))
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setitem(fsspec.config.conf, "s3", {"skip_instance_cache": True})
+    with pytest.raises(InputError, match="s3://bucket/a: .*Unable to locate credentials.*give this machine"):
+        open_storage("s3://bucket/a").children("")
