@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 
@@ -12,6 +13,8 @@ from splatart_ns.capture.robot import Joint, Robot
 from splatart_ns.capture.surface import Surface
 from splatart_ns.errors import InputError
 
+_log = logging.getLogger(__name__)
+
 _TURN = 1.75
 """Radian: joints that turn further than this are moved within a window of it, so that states have views in common."""
 _TRIES = 40
@@ -21,7 +24,7 @@ _TRIES = 40
 def draw_configurations(
     robot: Robot, frozen: Mapping[str, float], surfaces: Mapping[str, Surface], states: int, seed: int
 ) -> list[dict[str, float]]:
-    """The values of all movable joints for each state; every joint that is not held moves.
+    """The values of all movable joints for each state; every joint that is not held moves, if its limits let it.
 
     Part by part, from the root on, joints are drawn again while parts so far reach into each other, in a state or half
     way between the first two: the part's own, then also those above it, one more each time. Where `_TRIES` draws do not
@@ -34,6 +37,11 @@ def draw_configurations(
         InputError: a sliding joint without limits.
     """
     free = {j.name: j for j in robot.movable if j.name not in frozen and j.mimic is None}
+    for name, joint in free.items():
+        if joint.limits is not None and joint.limits[0] == joint.limits[1]:
+            found = f"joint {name!r} has limits {joint.limits[0]:g} to {joint.limits[1]:g} and does not move"
+            mend = f"correct its <limit>, or make its links one part by --freeze {name}={joint.limits[0]:g}"
+            _log.warning("%s: %s; %s", robot.path, found, mend)
     rng, again = (np.random.default_rng([seed, stream]) for stream in (0, 3))
     drawn = {name: _spread_values(joint, robot, states, rng) for name, joint in free.items()}
 

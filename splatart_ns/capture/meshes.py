@@ -22,6 +22,8 @@ _log = logging.getLogger(__name__)
 _GREY = (0.7, 0.7, 0.7)
 """The colour of what has none, in the mesh or in the URDF."""
 
+_LONGEST_EMPTY_STL = 1000
+"""Bytes."""
 _SUFFIXES = {".obj", ".dae", ".stl", ".glb", ".gltf", ".ply", ".off"}
 
 
@@ -85,6 +87,14 @@ def load_mesh(path: Path, colour: tuple[float, float, float] | None = None) -> S
     if not np.abs(surface.corners).max() < LONGEST:
         raise InputError(f"{path}: the mesh has corners that are not finite or far away; export it again.")
     return surface
+
+
+def is_empty_stl(path: Path) -> bool:
+    """Whether a file is an STL of no triangles, as CAD programs write it for a part without a body."""
+    if path.suffix.lower() != ".stl" or not path.is_file() or path.stat().st_size > _LONGEST_EMPTY_STL:
+        return False
+    data = read_bytes(path)
+    return data[80:] == bytes(4) or re.fullmatch(rb"\s*solid\b[^\n]*\n\s*endsolid\b[^\n]*\s*", data) is not None
 
 
 def box(size: np.ndarray, colour: tuple[float, float, float] | None = None) -> Surface:

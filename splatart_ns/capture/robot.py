@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
@@ -16,6 +17,8 @@ from splatart_ns.capture import meshes
 from splatart_ns.capture.surface import Surface, join, merge_coincident
 from splatart_ns.capture.values import LONGEST, show
 from splatart_ns.errors import InputError
+
+_log = logging.getLogger(__name__)
 
 MOVABLE = ("revolute", "continuous", "prismatic")
 _MOST_BYTES, _MOST_LINKS = 64 << 20, 10_000
@@ -78,7 +81,7 @@ class Robot:
     path: Path
     name: str
     links: dict[str, tuple[ElementTree.Element, ...]]
-    """Link name to its <visual> elements."""
+    """Link name to its <visual> elements that show anything."""
     joints: tuple[Joint, ...]
     root: str
 
@@ -167,12 +170,12 @@ class Robot:
         return merge_coincident(join(surfaces)) if surfaces else None
 
     def _link_surfaces(self, link: str) -> list[Surface]:
-        visuals = self.links[link]
-        return [_visual(v, self.path).moved(_origin(v, self.path)) for v in visuals if not _is_point(v, self.path)]
+        return [_visual(v, self.path).moved(_origin(v, self.path)) for v in self.links[link]]
 
 
 def read_urdf(path: Path) -> Robot:
-    """Read a URDF. Floating and planar joints are read as fixed, at their zero.
+    """Read a URDF. Floating and planar joints are read as fixed, at their zero; a warning says so, and of what else is
+    left out.
 
     Raises:
         InputError: not a URDF, or one whose links and joints do not make a tree.
@@ -197,12 +200,15 @@ def read_urdf(path: Path) -> Robot:
         name = _attribute(element, "name", path)
         if name in links:
             raise InputError(f"{path}: two links are called {name!r}; rename one.")
-        visuals = tuple(v for v in element.findall("visual") if v.find("geometry") is not None)
+        visuals = tuple(v for v in element.findall("visual") if _has_shape(v, path))
         for visual in visuals:
             material = visual.find("material")
             if material is not None and material.find("color") is None and material.get("name") in colours:
                 material.append(colours[material.get("name")].find("color"))
         links[name] = visuals
+    textures = {t.get("filename"): None for m in robot.iter("material") for t in m.findall("texture")}
+    for name in filter(None, textures):
+        _log.warning("%s: <texture filename=%r> is left out: only those that mesh files name are read", path, name)
     elements = robot.findall("joint")
     if max(len(links), len(elements)) > _MOST_LINKS:
         raise InputError(f"{path}: has {len(links)} links and {len(elements)} joints; give at most {_MOST_LINKS}.")
@@ -214,6 +220,8 @@ def _joint(element: ElementTree.Element, path: Path) -> Joint:
     name, type = _attribute(element, "name", path), _attribute(element, "type", path)
     if type not in (*MOVABLE, "fixed", "floating", "planar"):
         raise InputError(f"{path}: joint {name!r} is of type {type!r}; use revolute, continuous, prismatic or fixed.")
+    if type in ("floating", "planar"):
+        _log.warning("%s: joint %r is %s and not moved: it is held at its zero", path, name, type)
     parent, child = element.find("parent"), element.find("child")
     if parent is None or child is None:
         raise InputError(f"{path}: joint {name!r} lacks its <parent> or <child>; add it.")
@@ -305,10 +313,19 @@ def _children(joints: tuple[Joint, ...]) -> dict[str, list[Joint]]:
     return out
 
 
-def _is_point(visual: ElementTree.Element, path: Path) -> bool:
-    """Whether a <visual> is a box or a sphere without any extent, as some robots have for links without a shape."""
+def _has_shape(visual: ElementTree.Element, path: Path) -> bool:
+    """Whether a <visual> shows anything: some robots have links with a box or sphere without any extent, or with an
+    empty mesh."""
+    if visual.find("geometry") is None:
+        return False
     sizes = [(visual.find(f"geometry/{tag}"), key, n) for tag, key, n in (("box", "size", 3), ("sphere", "radius", 1))]
-    return any(shape is not None and not _numbers(shape, key, n, path).any() for shape, key, n in sizes)
+    if any(shape is not None and not _numbers(shape, key, n, path).any() for shape, key, n in sizes):
+        return False
+    mesh = visual.find("geometry/mesh")
+    if mesh is not None and meshes.is_empty_stl(file := find_mesh(_attribute(mesh, "filename", path), path)):
+        _log.warning("%s: the mesh is empty and left out", file)
+        return False
+    return True
 
 
 def _visual(visual: ElementTree.Element, path: Path) -> Surface:

@@ -82,7 +82,7 @@ def part_surfaces(robot: Robot, frozen: Mapping[str, float]) -> dict[str, Surfac
     """
     shaped = [part for part in robot.parts(frozen) if part.has_geometry]
     if not shaped:
-        raise InputError(f"{robot.path}: no link has a <visual>; there is nothing to render.")
+        raise InputError(f"{robot.path}: no link has a <visual> that shows anything; there is nothing to render.")
     if len(shaped) > 254:
         raise InputError(f"{robot.path}: has {len(shaped)} parts; labels have room for 254, freeze some joints.")
     return {part.name: robot.surface(part, frozen) for part in shaped}

@@ -115,3 +115,17 @@ def test_the_same_seed_draws_the_same_values_and_another_one_does_not(walker):
     first, again, other = (draw_configurations(*args(walker), 2, seed) for seed in (1, 1, 2))
     assert first == again != other
     assert np.isfinite([list(values.values()) for values in first]).all()
+
+
+def test_a_joint_that_its_limits_hold_is_named_in_a_warning(tmp_path, caplog):
+    links = [f'<link name="{name}">{BOX.format("0 0 0", "0.1 0.1 0.1")}</link>' for name in ("a", "b", "c")]
+    joints = [joint("b", "a", "0 0 1", "1 0 0", 0.1, 0.1), joint("c", "a", "0 0 2", "1 0 0")]
+    robot, surfaces = robot_of(tmp_path, links + joints)
+    draw_configurations(robot, {}, surfaces, 2, 0)
+    assert [record.getMessage().split(": ", 1)[1] for record in caplog.records] == [
+        "joint 'b' has limits 0.1 to 0.1 and does not move; correct its <limit>, or make its links one part by "
+        "--freeze b=0.1"
+    ]
+    caplog.clear()
+    draw_configurations(robot, {"b": 0.1}, part_surfaces(robot, {"b": 0.1}), 2, 0)
+    assert not caplog.records

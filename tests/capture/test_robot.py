@@ -168,6 +168,43 @@ def test_a_shape_without_any_extent_is_none(tmp_path):
     assert robot.surface(robot.parts()[4], {}) is None
 
 
+@pytest.mark.parametrize("data", [bytes(84), b"solid hook\nendsolid hook\n"], ids=["binary", "text"])
+def test_an_empty_mesh_is_no_shape_and_named_in_a_warning(tmp_path, caplog, data):
+    (tmp_path / "empty.STL").write_bytes(data)
+    robot = read_urdf(write(tmp_path, URDF.replace('<sphere radius="0.5"/>', '<mesh filename="empty.STL"/>')))
+    assert not robot.parts()[4].has_geometry
+    assert "empty.STL: the mesh is empty" in caplog.text
+
+
+def test_a_mesh_cut_off_before_its_triangles_is_refused(tmp_path):
+    (tmp_path / "cut.stl").write_bytes(bytes(80) + (50).to_bytes(4, "little"))
+    robot = read_urdf(write(tmp_path, URDF.replace('<sphere radius="0.5"/>', '<mesh filename="cut.stl"/>')))
+    with pytest.raises(InputError, match="cut.stl: the mesh holds no triangles"):
+        robot.surface(robot.parts()[4], {})
+
+
+@pytest.mark.parametrize("type", ["planar", "floating"])
+def test_a_joint_of_a_kind_that_is_not_moved_is_named_in_a_warning(tmp_path, caplog, type):
+    read_urdf(write(tmp_path, URDF.replace('type="continuous"', f'type="{type}"')))
+    assert f"crane.urdf: joint 'wrist' is {type}" in caplog.text
+
+
+def test_a_texture_of_the_urdf_is_named_in_a_warning(tmp_path, caplog):
+    read_urdf(write(tmp_path, URDF.replace("</material>", '<texture filename="wood.png"/></material>', 1)))
+    assert "crane.urdf: <texture filename='wood.png'> is left out" in caplog.text
+    caplog.clear()
+    read_urdf(write(tmp_path, URDF.replace("</material>", '<texture filename=""/></material>', 1)))
+    assert not caplog.text
+
+
+@pytest.mark.parametrize("scale", ["1 1 1 1", "2"])
+def test_a_mesh_scale_that_is_no_three_numbers_is_refused(tmp_path, scale):
+    text = URDF.replace('<sphere radius="0.5"/>', f'<mesh filename="a.stl" scale="{scale}"/>')
+    robot = read_urdf(write(tmp_path, text))
+    with pytest.raises(InputError, match=f"<mesh scale='{scale}'> should hold 3 finite numbers"):
+        robot.surface(robot.parts()[4], {})
+
+
 def test_a_mesh_that_is_scaled_flat_is_refused(tmp_path):
     robot = read_urdf(write(tmp_path, URDF.replace('<sphere radius="0.5"/>', '<mesh filename="a.stl" scale="1 1 0"/>')))
     with pytest.raises(InputError, match="<mesh scale='1 1 0'> makes the mesh flat"):

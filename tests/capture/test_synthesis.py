@@ -249,6 +249,18 @@ def test_a_failure_half_way_leaves_no_folder(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["toy.urdf"]
 
 
+def test_a_moving_link_may_have_a_shape_without_any_extent(tmp_path):
+    path = tmp_path / "toy.urdf"
+    path.write_text(URDF.replace('<cylinder radius="0.04" length="0.2"/>', '<sphere radius="0"/>'))
+    truth = read(synthesize(path, tmp_path / "c", SMALL), "ground_truth.json")
+    assert {part["name"]: part["id"] for part in truth["parts"]} == {
+        "base": 1,
+        "arm": 2,
+        "knuckle": None,
+        "finger": None,
+    }
+
+
 def test_a_robot_without_shapes_is_refused(tmp_path):
     path = tmp_path / "bare.urdf"
     path.write_text('<robot name="bare"><link name="base"/></robot>')
