@@ -194,14 +194,16 @@ def _check_labels(capture: Capture, pixels: np.ndarray) -> Iterator[Problem]:
         yield Problem("warning", capture.path, "there is only one part", "label at least two parts to find a joint")
     for i, name in capture.parts.items():
         part = f"part {i} ({name})"
+        missing = [s for k, s in enumerate(capture.states) if labelled[k] and k not in seen[i]]
+        if not missing:
+            continue
+        # Where every frame is labelled there is no mend, and the motions of several others are worth a fit.
+        hidden = all(frame.labels is not None for state in missing for frame in state.split("train"))
+        severity = "warning" if len(seen[i]) > 1 or hidden and compared > 1 else "error"
         if len(seen[i]) == 0:
-            mend = "label it in some training frames of every state, or take it out of semantic_classes"
-            yield Problem("error", capture.path, f"{part} is never labelled", mend)
-        elif len(seen[i]) < labelled.sum():
-            missing = [s for k, s in enumerate(capture.states) if labelled[k] and k not in seen[i]]
+            found = f"{part} is never labelled"
+            mend = "take it out of semantic_classes, or label it in some training frames of every state"
+        else:
             found = f"{part} is not labelled in {missing[0].name}, so its motion cannot be known there"
-            # Where every frame is labelled there is no mend, and the motions of several others are worth a fit.
-            hidden = all(frame.labels is not None for state in missing for frame in state.split("train"))
-            severity = "warning" if len(seen[i]) > 1 or hidden and compared > 1 else "error"
             mend = "label it in some training frames of that state"
-            yield Problem(severity, capture.path, found, f"{mend}, if one shows it" if hidden else mend)
+        yield Problem(severity, capture.path, found, f"{mend}, if one shows it" if hidden else mend)

@@ -10,6 +10,7 @@ import torch
 from splatart_ns.bundle import ArticulatedSplat
 from splatart_ns.bundle.dataset import Dataset, DatasetOptions
 from splatart_ns.bundle.dataset_capture import write_dataset
+from splatart_ns.capture.check import check_capture, require_valid
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.images import read_depth, read_labels
 from splatart_ns.errors import InputError
@@ -112,6 +113,14 @@ def test_what_is_written_is_read_as_the_same_capture(dataset, tmp_path):
     unit = json.loads((folder / "state_01/transforms.json").read_text())["depth_unit_scale_factor"]
     np.testing.assert_allclose(read_depth(frame.depth, unit), sample.depth, atol=0.5001 * unit)
     assert unit < 1e-3 * dataset.radius
+
+
+def test_a_dataset_of_a_bundle_whose_part_ids_have_gaps_can_be_fitted(splat, tmp_path):
+    folder = tmp_path / "capture"
+    write_dataset(Dataset(splat, replace(OPTIONS, resolution=64)), folder, 18)
+    told = [(p.severity, p.message) for p in check_capture(folder) if "never labelled" in p.message]
+    assert told == [("warning", f"part {i} (part_{i}) is never labelled") for i in range(3, 7)]
+    assert require_valid(folder).parts[7] == "latch"
 
 
 def test_the_ground_truth_is_that_of_the_bundle(dataset, splat, tmp_path):

@@ -246,6 +246,18 @@ def test_a_part_that_is_never_labelled_is_an_error(capture_folder):
     assert found(check_capture(capture_folder)) == ["capture: part 2 (door) is never labelled"]
 
 
+def test_a_class_that_fully_labelled_frames_never_show_is_a_warning(capture_folder, edit):
+    for k in range(2):
+        relabel(capture_folder / f"state_0{k}", 2, 3)
+        edit(capture_folder / f"state_0{k}/transforms.json", lambda m: m["semantic_classes"].insert(2, "part_2"))
+    problems = check_capture(capture_folder)
+    assert found(problems) == []
+    assert found(problems, "warning") == ["capture: part 2 (part_2) is never labelled"]
+
+    edit(capture_folder / "state_01/transforms.json", lambda m: m["frames"][0].pop("semantics_path"))
+    assert found(check_capture(capture_folder)) == ["capture: part 2 (part_2) is never labelled"]
+
+
 def test_points_masks_and_depths_are_checked(capture_folder, edit):
     np.save(capture_folder / "state_00/d.npy", np.zeros((4, 7)))
     put(capture_folder / "state_00/m.png", np.zeros((16, 16), np.uint8))
