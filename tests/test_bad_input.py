@@ -252,6 +252,7 @@ def test_bad_options_of_render_are_refused(refused, hinge_fit, tmp_path, argumen
         (["--states", 3], "--dataset is not given; give it, or leave out --states."),
         (["--views", "hemisphere", "--seed", 1], "give it, or leave out --views and --seed."),
         (["--frames", 3], "--sweep is not given; give it, or leave out --frames."),
+        (["--sweep", "--fps", 9], "new is no .gif or .mp4; give one, or leave out --fps."),
         (["--dataset", 9, "--channel", "depth"], "--dataset chooses what it shows; leave out --channel."),
         (["--dataset", 9, "--background", 0, 0, 0, "--azimuth", 0], "leave out --azimuth and --background."),
         (["--dataset", 9, "--sweep", "--fps", 9], "leave out --sweep and --fps."),
@@ -261,6 +262,13 @@ def test_bad_options_of_render_are_refused(refused, hinge_fit, tmp_path, argumen
 def test_options_that_would_change_nothing_are_refused(refused, hinge_fit, tmp_path, arguments, expected):
     assert expected in refused("render", hinge_fit, "--output", tmp_path / "new", *arguments)
     assert contents(tmp_path) == {}
+
+
+def test_a_sweep_of_what_did_not_move_is_refused(refused, bundle, tmp_path):
+    edit(bundle / "articulation.json", lambda a: a["joints"][0].update(values=[0.0, 0.0], limits=[0.0, 0.0]))
+    sentence = refused("render", bundle, "--sweep", "--output", tmp_path / "new.gif")
+    assert f"{bundle}: has no joint that moved, for --sweep to show; leave it out." in sentence
+    assert not (tmp_path / "new.gif").exists()
 
 
 def test_a_joint_is_not_set_that_the_trajectory_moves(refused, hinge_fit, tmp_path):

@@ -24,6 +24,8 @@ from splatart_ns.files import replacing
 from splatart_ns.splats.palette import part_colours
 
 Output = Literal["rgb", "depth", "accumulation", "parts"]
+_FILMS = {".gif", ".mp4"}
+"""How the names of films end that can be written."""
 _OTHER_FORMATS = {".png", ".apng", ".jpg", ".jpeg", ".webp", ".avif", ".bmp", ".tif", ".tiff", ".exr", ".svg", ".pdf"}
 _OTHER_FORMATS |= {".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".ogv", ".flv"}
 """Of pictures and films; whoever names one expects no folder."""
@@ -95,6 +97,11 @@ def write_frames(frames: Iterable[np.ndarray], path: Path, fps: float = 30.0) ->
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; give a .gif, an .mp4 or a folder")
     return _write_pngs(frames, path)
+
+
+def is_called_as_a_file(path: Path) -> bool:
+    """Whether a path has the name of a picture or film, and is no folder in spite of it."""
+    return path.suffix.lower() in _FILMS | _OTHER_FORMATS and not path.is_dir()
 
 
 def _write_pngs(frames: Iterable[np.ndarray], folder: Path) -> int:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import trimesh
 
+from splatart_ns.bundle.animation import is_called_as_a_file
 from splatart_ns.bundle.bundle import Bundle, Joint
 from splatart_ns.bundle.dataset import Dataset, Sample
 from splatart_ns.bundle.posing import configured_motions
@@ -43,13 +44,16 @@ def write_dataset(
         Whether there is a ground truth.
 
     Raises:
-        InputError: a count below the number of states, a folder that holds more images, or something else.
+        InputError: a count below the number of states, a folder that holds more images, or something else, or that is
+            called as a picture or film.
     """
     states = dataset.options.states
     if count > _MOST:
         raise InputError(f"--dataset is {count}; give at most {_MOST} images")
     if count < states:
         raise InputError(f"--dataset is {count}; give at least an image for each of the {states} --states")
+    if is_called_as_a_file(folder):
+        raise InputError(f"{folder}: is called as a picture or film, but a dataset is a folder; give another --output")
     _claim(dataset, folder)
     if (there := sum(1 for _ in folder.glob("state_*/images/[0-9]*.png"))) > count:
         raise InputError(f"{folder}: holds {there} images, more than --dataset {count}; give another --output")

@@ -97,6 +97,7 @@ class Render:
 
     def _check_all_count(self) -> None:
         """Refuse options that would change nothing."""
+        film = self.output.suffix.lower() in (".gif", ".mp4") and not self.output.is_dir()
         shown = ("configuration", "set", "sweep", "trajectory", "data", "channel", "azimuth", "elevation", "background")
         unused = (
             (self.dataset is not None, "--dataset chooses what it shows;", (*shown, "fps")),
@@ -104,6 +105,7 @@ class Render:
             (self.data is not None, "--data has cameras of its own;", ("resolution", "azimuth", "elevation")),
             (self.data is None, "--data is not given; give it, or", ("camera",)),
             (not self.sweep, "--sweep is not given; give it, or", ("frames",)),
+            (not film, f"--output {self.output} is no .gif or .mp4; give one, or", ("fps",)),
         )
         defaults = {field.name: field.default for field in fields(self)}
         for applies, why, names in unused:
@@ -131,6 +133,8 @@ class Render:
             base = configurations.read_configuration(self.configuration, bundle)
         held = configurations.parse_settings(sum(self.set, ()), bundle)
         base |= held
+        if self.sweep and not any(configurations.sweep(bundle, {}, 1)):
+            raise InputError(f"{self.bundle}: has no joint that moved, for --sweep to show; leave it out.")
         if self.trajectory is not None:
             rows = configurations.read_trajectory(self.trajectory, bundle)
             if both := held.keys() & rows[0].keys():

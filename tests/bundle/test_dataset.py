@@ -193,6 +193,13 @@ def test_a_folder_that_holds_something_else_is_refused(splat, dataset, bundle, t
         write_dataset(dataset, tmp_path / "other", 3)
 
 
+@pytest.mark.parametrize("name", ["x.gif", "x.MP4", "x.png"])
+def test_a_dataset_is_not_called_as_a_picture_or_film(dataset, tmp_path, name):
+    with pytest.raises(InputError, match=f"{name}: is called as a picture or film"):
+        write_dataset(dataset, tmp_path / name, 3)
+    assert contents(tmp_path) == {}
+
+
 @pytest.mark.parametrize("options", [{"states": 0}, {"states": 2.5}, {"resolution": 7}, {"views": "top"}, {"seed": -1}])
 def test_options_that_make_no_sense_are_refused(splat, options):
     with pytest.raises(InputError, match=f"--{next(iter(options))} is"):
