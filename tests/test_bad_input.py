@@ -2,9 +2,12 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import pytest
+
+from splatart_ns.plugin.fit import Settings, require_fittable
 
 TRANSFORMS = "state_00/transforms.json"
 
@@ -310,6 +313,19 @@ def test_a_bundle_among_the_files_of_the_capture_is_refused(refused, capture):
     for output in (capture, capture.parent, capture / "state_00"):
         assert "choose another --output-dir" in refused("batch", capture, "--output-dir", output)
     assert contents(capture) == before
+
+
+def test_states_of_different_worlds_are_refused_before_any_work(refused, capture, tmp_path):
+    def move(transforms):
+        for frame in transforms["frames"]:
+            frame["transform_matrix"][0][3] += 4.0
+
+    edit(capture / "state_01/transforms.json", move)
+    sentence = refused("fit", capture, "--output-dir", tmp_path / "new", "--quality", "draft")
+    assert f"{capture}/state_01: its cameras do not look where those of state_00 do" in sentence
+    assert "--worlds similar" in sentence and not (tmp_path / "new").exists()
+    settings = Settings("draft", None, 0)
+    assert [require_fittable(capture, replace(settings, worlds=w)).path for w in ("similar", "shared")] == [capture] * 2
 
 
 @pytest.mark.parametrize("output", ["file", "file/new", "file/new.gif", "file/new.mp4", "new.webp"])

@@ -16,6 +16,8 @@ Worlds = Literal["shared", "rigid", "similar"]
 """How the states' worlds differ: not at all, by a rigid motion (a device measured lengths), or by one with a scale."""
 UNLABELLED = 255
 """The label of a pixel that nobody labelled."""
+REACH = 1.5
+"""Along each axis of the normalised world, the object is looked for so far from its centre."""
 
 
 @dataclass(frozen=True)

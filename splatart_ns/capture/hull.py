@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from splatart_ns.capture.capture import UNLABELLED
+from splatart_ns.capture.capture import REACH, UNLABELLED
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.camera import project_points
 
@@ -74,7 +74,7 @@ class Carving:
 
 def carve(views: Sequence[View]) -> Carving:
     """Carve a box around all that 3 of 4 views agree on. Every view needs a silhouette that is not empty."""
-    low, high = torch.full((3,), -1.5), torch.full((3,), 1.5)
+    low, high = torch.full((3,), -REACH), torch.full((3,), REACH)
     for count in (_COARSE, _FINE):
         size = float((high - low).max()) / count
         axes = [torch.arange(float(a) + size / 2, float(b), size) for a, b in zip(low, high, strict=True)]

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatart_ns.capture.capture import Capture, State, Worlds
+from splatart_ns.capture.capture import REACH, Capture, State, Worlds
+from splatart_ns.errors import InputError
 
 APART, UNLIKE = 1.0, 3.0
 """States of one world hardly ever have cameras that look so far apart, in half widths of what they see there, or see so
@@ -51,6 +52,16 @@ def looks_elsewhere(capture: Capture, state: State) -> str | None:
     if apart < APART and times < UNLIKE:
         return None
     return f"its cameras do not look where those of {capture.states[0].name} do: the states may have different worlds"
+
+
+def require_one_place(capture: Capture) -> None:
+    """Raises `InputError` where states said to share a world look so far apart that no fit finds the object in both."""
+    shared = capture.normalization
+    out = [np.abs(shared.scale * (s.normalization().centre - shared.centre)).max() > REACH for s in capture.states]
+    for state, is_out in zip(capture.states[1:], out[1:], strict=True):
+        if (is_out or out[0]) and (strange := looks_elsewhere(capture, state)) is not None:
+            mend = f"{OTHER_WORLDS_MEND}, or with --worlds shared to try it as one"
+            raise InputError(f"{capture.path / state.name}: {strange}; {mend}.")
 
 
 def _placed(state: State, T: np.ndarray) -> State:

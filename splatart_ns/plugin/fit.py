@@ -25,6 +25,7 @@ from splatart_ns.capture.capture import Capture, Worlds
 from splatart_ns.capture.check import require_valid
 from splatart_ns.capture.digest import capture_digest
 from splatart_ns.capture.values import is_inside
+from splatart_ns.capture.worlds import require_one_place
 from splatart_ns.errors import InputError
 from splatart_ns.files import write_json
 from splatart_ns.machine import num_cores
@@ -224,6 +225,8 @@ def require_fittable(capture_path: Path, settings: Settings) -> Capture:
         InputError: for a capture, a root, a joint or a seed that cannot be used.
     """
     capture, root = require_valid(capture_path), settings.root
+    if settings.worlds is None:
+        require_one_place(capture)
     if root is not None and root not in capture.parts.values():
         raise InputError(
             f"{capture_path} has no part '{root}'; choose --root from {', '.join(capture.parts.values())}."

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatart_ns.capture.capture import CaptureError
+from splatart_ns.capture.capture import CaptureError, Normalization
 from splatart_ns.capture.formats import load_capture
-from splatart_ns.capture.worlds import focus_on_focus, in_one_world, looks_elsewhere
+from splatart_ns.capture.worlds import focus_on_focus, in_one_world, looks_elsewhere, require_one_place
+from splatart_ns.errors import InputError
 
 
 @pytest.fixture
@@ -79,6 +80,21 @@ def test_states_of_different_worlds_are_told(capture, scale, shift, strange):
     told = [looks_elsewhere(moved, state) for state in moved.states]
     assert told[0] is None and (told[1] is not None) == strange
     assert looks_elsewhere(replace(moved, worlds="similar"), moved.states[1]) is None
+
+
+@pytest.mark.parametrize(("shift", "refused"), [(0, False), (1, False), (8, True)])
+def test_states_that_look_too_far_apart_for_a_fit_are_refused(capture, shift, refused):
+    T = np.eye(4)
+    T[0, 3] = shift
+    moved = in_one_world(capture, np.stack([np.eye(4), T]))
+    frames = [frame for state in moved.states for frame in state.frames]
+    moved = replace(moved, normalization=Normalization.from_frames(frames))
+    if refused:
+        with pytest.raises(InputError, match="state_1: its cameras do not look where .* --worlds similar .* shared"):
+            require_one_place(moved)
+    else:
+        require_one_place(moved)
+    require_one_place(replace(moved, worlds="similar"))
 
 
 @pytest.mark.parametrize("value", ["similar", "everywhere", ["rigid"]])
