@@ -9,6 +9,7 @@ import json
 import math
 import os
 import reprlib
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -56,8 +57,16 @@ def is_inside(folder: Path, path: Path) -> bool:
 
 
 def read_json(file: Path) -> dict[str, Any]:
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        """What else would take the last of two values without a word."""
+        values = dict(pairs)
+        if len(values) < len(pairs):
+            twice = next(key for key, times in Counter(key for key, _ in pairs).items() if times > 1)
+            raise CaptureError(file, f"an object has the key {show(twice)} twice", "keep one of them")
+        return values
+
     try:
-        value = json.loads(read_text(file))
+        value = json.loads(read_text(file), object_pairs_hook=unique)
     except (ValueError, RecursionError) as error:
         raise CaptureError(file, f"the file is not JSON ({error})", "write it again, or restore a copy") from None
     if not isinstance(value, dict):

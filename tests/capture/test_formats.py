@@ -260,6 +260,13 @@ def test_broken_json_is_an_input_error(capture_folder, text):
         load_capture(capture_folder)
 
 
+def test_a_key_that_an_object_has_twice_is_an_input_error(capture_folder):
+    text = (capture_folder / FILE).read_text()
+    (capture_folder / FILE).write_text(text.replace('"fl_x"', '"fl_x": 30.0, "fl_x"', 1))
+    with pytest.raises(InputError, match=r"transforms\.json: an object has the key 'fl_x' twice; keep one of them"):
+        load_capture(capture_folder)
+
+
 def test_a_folder_without_a_capture_is_an_input_error(tmp_path, capture_folder):
     for path in (tmp_path / "nothing", tmp_path, capture_folder / FILE):
         with pytest.raises(InputError):
