@@ -8,8 +8,8 @@ import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,22 @@ def replacing(path: Path) -> Iterator[Path]:
             os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_all(paths: Sequence[Path]) -> Iterator[list[Path]]:
+    """`replacing` for files that belong together: all are renamed, in their order, when the block ends well. Otherwise
+    nothing is left of it, nor of folders that were made for it."""
+    new = {folder for parent in {path.parent for path in paths} for folder in (parent, *parent.parents)}
+    with ExitStack() as stack:
+        for folder in sorted(folder for folder in new if not folder.exists()):
+            stack.callback(_remove_empty, folder)
+        yield [stack.enter_context(replacing(path)) for path in reversed(paths)][::-1]
+
+
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()
 
 
 @contextmanager

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from splatart_ns.files import new_folder, replacing, write_json
+from splatart_ns.files import new_folder, replacing, replacing_all, write_json
 
 
 def test_a_block_that_ends_well_puts_the_file_in_place(tmp_path):
@@ -25,6 +25,21 @@ def test_a_block_that_fails_leaves_the_last_good_file(tmp_path):
         raise RuntimeError
     assert path.read_text() == "good"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_files_that_belong_together_change_all_or_none(tmp_path):
+    (tmp_path / "a.txt").write_text("good")
+    paths = [tmp_path / "a.txt", tmp_path / "new/deep/b.txt"]
+    with pytest.raises(RuntimeError), replacing_all(paths) as temporary:
+        for file in temporary:
+            file.write_text("half")
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == [tmp_path / "a.txt"] and paths[0].read_text() == "good"
+    with replacing_all(paths) as temporary:
+        for file in temporary:
+            file.write_text("whole")
+        assert paths[0].read_text() == "good"
+    assert [path.read_text() for path in paths] == ["whole", "whole"]
 
 
 @pytest.mark.parametrize("writing", [replacing, new_folder])

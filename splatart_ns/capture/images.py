@@ -116,8 +116,7 @@ def write_depth(path: Path, depth: np.ndarray, unit: float) -> None:
 def write_png(path: Path, image: np.ndarray) -> None:
     """Write grey, BGR or BGRA pixels (uint8 or uint16), making the folder where it is missing."""
     with replacing(path) as temporary:
-        if not cv2.imwrite(str(temporary), image):
-            raise InputError(f"{path}: the image cannot be written; check the space on the disk.")
+        temporary.write_bytes(cv2.imencode(".png", image)[1])
 
 
 def read_sized(path: Path, reader: Callable[[Path], np.ndarray], camera: Camera) -> np.ndarray:

@@ -29,7 +29,7 @@ from splatart_ns.capture.formats import SPLITS, TRANSFORMS, load_capture, load_s
 from splatart_ns.capture.images import MAX_LABEL, write_png
 from splatart_ns.capture.values import DISTORTION, is_inside, read_json, relative_path, show
 from splatart_ns.errors import InputError, printable
-from splatart_ns.files import new_folder, write_json
+from splatart_ns.files import new_folder, replacing_all, write_json
 
 FRAME_FILES = ("file_path", "semantics_path", "mask_path", "object_mask_path", "depth_file_path")
 """Where a frame in a transforms.json names its files."""
@@ -116,11 +116,6 @@ def import_labels(path: Path, labels: Path) -> LabelImport:
         match.file = _label_file(match.root, match.frame, taken)
         if not is_inside(path, match.file):
             raise CaptureError(match.file.parent, "the folder is a link out of the capture", "remove the link")
-    with ThreadPoolExecutor() as pool:
-        for _ in pool.map(draw, matches):  # nothing is written before all shapes are known to make sense
-            pass
-        for _ in pool.map(lambda match: write_png(match.file, draw(match)), matches):
-            pass
     files = {match.frame.image: match.file for match in matches}
     for file, meta in metas.items():
         for entry in meta["frames"]:
@@ -128,7 +123,11 @@ def import_labels(path: Path, labels: Path) -> LabelImport:
             if image in files:
                 entry["semantics_path"] = files[image].relative_to(file.parent).as_posix()
         meta["semantic_classes"] = ["background", *parts]
-        write_json(file, meta)
+    with replacing_all([*(match.file for match in matches), *metas]) as temporary, ThreadPoolExecutor() as pool:
+        for _ in pool.map(lambda match, file: write_png(file, draw(match)), matches, temporary[: len(matches)]):
+            pass
+        for file, meta in zip(temporary[len(matches) :], metas.values(), strict=True):
+            write_json(file, meta)
     return LabelImport(
         format=annotations.format,
         labelled=len(matches),

@@ -1,7 +1,9 @@
 import dataclasses
+import errno
 import json
 import os
 import shutil
+from itertools import count
 from pathlib import Path
 
 import cv2
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 from label_exports import flat_name, label_studio_name, roboflow_name, write_coco, write_masks, write_yolo
 
+from splatart_ns.capture import label_import
 from splatart_ns.capture.check import check_capture
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.images import read_labels
@@ -171,6 +174,32 @@ def test_labels_go_into_the_capture_itself_only_on_request(capture_folder, tmp_p
     meta = json.loads((capture_folder / "state_00/transforms.json").read_text())
     assert meta["frames"][3]["semantics_path"] == "semantics/0003.png"
     assert meta["semantic_classes"] == ["background", "base", "door"]
+
+
+@pytest.mark.parametrize("written", ["png", "json"])
+def test_an_import_that_fails_half_way_leaves_the_capture_as_it_was(capture_folder, tmp_path, monkeypatch, written):
+    write, calls = getattr(label_import, f"write_{written}"), count()
+
+    def fail_at_second(file, value):
+        if next(calls):
+            raise OSError(errno.ENOSPC, "No space left on device", str(file))
+        write(file, value)
+
+    def files():
+        return {f: f.read_bytes() for f in capture_folder.rglob("*") if f.is_file()}
+
+    export = write_coco(load_capture(capture_folder), tmp_path / "labels.json", "runs")
+    state = capture_folder / "state_00"
+    (state / "labels").rename(state / "semantics")  # where new labels go
+    cv2.imwrite(str(state / "semantics/0000.png"), np.ones((16, 16), np.uint8))
+    text = (state / "transforms.json").read_text()
+    (state / "transforms.json").write_text(text.replace('"labels/', '"semantics/'))
+    before = files()
+    monkeypatch.setattr(label_import, f"write_{written}", fail_at_second)
+    with pytest.raises(OSError, match="No space") as error:
+        import_labels(capture_folder, export)
+    assert ".tmp" not in error.value.filename
+    assert files() == before and not (capture_folder / "state_01/semantics").exists()
 
 
 def test_a_few_labelled_frames_leave_the_others_as_they_are(capture_folder, tmp_path):
