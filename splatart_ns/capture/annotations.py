@@ -217,20 +217,30 @@ def _corners(file: Path, what: str, values: Any) -> np.ndarray:
 
 
 def _yolo_texts(path: Path, files: Sequence[Path]) -> list[Path]:
-    """Texts in folders called `labels`; without any, all where there is a data.yaml or one of them looks like YOLO."""
+    """Texts in folders called `labels`; without any, all but lists of images, as darknet's train.txt, where there is a
+    data.yaml or one of them looks like YOLO."""
     texts = [f for f in files if f.suffix == ".txt" and f.name not in _CLASS_LISTS]
     if inner := [f for f in texts if "labels" in f.relative_to(path).parts]:
         return inner
-    texts = [f for f in texts if not f.name.upper().startswith("README")]
-    return texts if any(f.name in _CLASS_YAMLS for f in files) or any(_is_yolo(f) for f in texts) else []
+    heads = {f: _first_line(f) for f in texts if not f.name.upper().startswith("README")}
+    texts = [f for f, head in heads.items() if not head.lower().endswith(IMAGE_SUFFIXES)]
+    return texts if any(f.name in _CLASS_YAMLS for f in files) or any(_is_yolo(heads[f]) for f in texts) else []
 
 
-def _is_yolo(file: Path) -> bool:
-    """Whether a text begins with a class number and the coordinates of a polygon or box."""
+def _first_line(file: Path) -> str:
+    """The first line that is not empty; of what is no text, none."""
     try:
-        number, *coordinates = read_text(file).lstrip().partition("\n")[0].split()
+        return read_text(file).lstrip().partition("\n")[0].rstrip()
+    except CaptureError:
+        return ""
+
+
+def _is_yolo(line: str) -> bool:
+    """Whether a line holds a class number and the coordinates of a polygon or box."""
+    try:
+        number, *coordinates = line.split()
         return number.isdecimal() and len([float(x) for x in coordinates]) >= 4
-    except (CaptureError, ValueError):
+    except ValueError:
         return False
 
 

@@ -303,6 +303,21 @@ def test_polygons_need_no_data_yaml_to_be_known(capture_folder, tmp_path):
     assert import_labels(capture_folder, export).format == "YOLO"
 
 
+@pytest.mark.parametrize("listed", ["data/obj_train_data/{}.png", "C:\\my data\\{}.JPG\r"])
+def test_lists_of_images_beside_polygons_are_passed_over(capture_folder, tmp_path, listed):
+    """Darknet's train.txt, as CVAT writes it."""
+    export = write_yolo(load_capture(capture_folder), tmp_path / "export")
+    (export / "data.yaml").unlink()
+    (export / "obj.names").write_text("base\ndoor\nignore\n")
+    (export / "obj.data").write_text("classes = 3\ntrain = data/train.txt\nnames = data/obj.names\n")
+    (export / "train/labels").rename(export / "obj_train_data")
+    stems = sorted(f.stem for f in (export / "obj_train_data").iterdir())
+    (export / "train.txt").write_text("".join(listed.format(stem) + "\n" for stem in stems))
+    (export / "valid.txt").write_text("")
+    done = import_labels(capture_folder, export)
+    assert (done.format, done.labelled, done.unmatched) == ("YOLO", 16, ())
+
+
 def test_other_files_beside_coco_are_passed_over(capture_folder, tmp_path):
     export = tmp_path / "export"
     write_coco(load_capture(capture_folder), export / "result.json", "runs")
