@@ -26,6 +26,9 @@ _CLASS_LISTS = ("classes.txt", "obj.names", "_darknet.labels")
 _MASK_CLASS_LISTS = (*_CLASS_LISTS, "_classes.csv", "labelmap.txt")
 _CLASS_YAMLS = ("data.yaml", "data.yml", "dataset.yaml")
 _NOT_COCO, _AS_COCO = "it is no COCO file", "export the labels as COCO segmentation"
+_MARK = re.compile(r"[._-](mask|label|seg)s?\.png$", re.IGNORECASE)
+"""How masks' names end where they lie beside the images."""
+_IMAGE_FOLDERS = {"images", "image", "imgs", "img", "rgb", "JPEGImages"}
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 
@@ -59,7 +62,8 @@ def read_annotations(path: Path) -> Annotations:
     - COCO: `.json` files with `images`, `annotations` and `categories`; polygons, runs, compressed runs.
     - YOLO: `.txt` files of "class x y x y ..." lines, coordinates from 0 to 1, beside a `data.yaml` or `classes.txt`.
     - Masks: PNGs of class ids in one channel, beside Roboflow's `_classes.csv` ("Pixel Value, Class"), or a
-      `classes.txt` whose line numbers are the ids, from 0 if the first is "background", else from 1.
+      `classes.txt` whose line numbers are the ids, from 0 if the first is "background", else from 1. `x.png` beside
+      `x_mask.png`, and what lies in a folder of images beside one of masks, is none.
 
     An image without a shape, or whose mask holds the background alone, is not labelled; later shapes cover earlier
     ones. Nothing outside the folder is opened. Hidden files, and other JSON beside COCO files, are passed over.
@@ -325,20 +329,25 @@ class _YoloShapes:
 
 def _read_masks(path: Path, files: Sequence[Path], pngs: Sequence[Path]) -> Annotations:
     named = _mask_classes(path, files)
-    marked = [f for f in pngs if f.stem.endswith("_mask")]  # Roboflow's, which lie beside the images
+    pngs = _masks_among(path, pngs)
     place = np.zeros(max(UNLABELLED, *named) + 1, np.uint16)
     for k, value in enumerate(named, start=1):
         place[value] = k
     background = [value for value, name in named.items() if name.lower() in BACKGROUND_NAMES]
     with ThreadPoolExecutor() as pool:
-        blank = list(pool.map(lambda file: _is_blank(file, background), marked or pngs))
+        blank = list(pool.map(lambda file: _is_blank(file, background), pngs))
     images = []
-    for file in (file for file, nothing in zip(marked or pngs, blank, strict=True) if not nothing):
-        name = file.relative_to(path).as_posix()
-        if marked:
-            name = re.sub(r"_mask\.png$", ".png", name, flags=re.IGNORECASE)
+    for file in (file for file, nothing in zip(pngs, blank, strict=True) if not nothing):
+        name = _MARK.sub(".png", file.relative_to(path).as_posix())
         images.append(AnnotatedImage(file, name, image_size(file), _Mask(file, place, tuple(named))))
     return Annotations("masks", tuple(named.values()), tuple(images))
+
+
+def _masks_among(path: Path, pngs: Sequence[Path]) -> Sequence[Path]:
+    """The PNGs that are no pictures: those that are marked, as Roboflow's x_mask.png beside x.png; else those outside
+    folders of images; else all."""
+    marked = [f for f in pngs if _MARK.search(f.name)]
+    return marked or [f for f in pngs if not _IMAGE_FOLDERS & {*f.relative_to(path).parts[:-1]}] or pngs
 
 
 def _is_blank(file: Path, background: Sequence[int]) -> bool:

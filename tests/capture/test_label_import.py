@@ -286,6 +286,22 @@ def test_an_export_may_lie_in_a_folder_of_any_name(capture_folder, tmp_path):
         import_labels(capture_folder, export)
 
 
+@pytest.mark.parametrize("mask", ["{}_mask.png", "{}-Mask.png", "{}.labels.png", "../masks/{}.png"])
+def test_pictures_beside_masks_are_not_taken_for_labels(capture_folder, tmp_path, mask):
+    truth = all_labels(capture_folder)
+    (tmp_path / "export/images").mkdir(parents=True)
+    (tmp_path / "export/masks").mkdir()
+    (tmp_path / "export/classes.txt").write_text("base\ndoor\n")
+    for state in load_capture(capture_folder).states:
+        for frame in state.frames:
+            stem = f"{state.name}_{frame.image.stem}"
+            shutil.copy(frame.image, tmp_path / f"export/images/{stem}.png")
+            shutil.copy(frame.labels, tmp_path / "export/images" / mask.format(stem))
+    without_labels(capture_folder)
+    assert import_labels(capture_folder, tmp_path / "export").unmatched == ()
+    assert all_labels(capture_folder) == truth
+
+
 def test_texts_beside_masks_are_not_taken_for_labels(capture_folder, tmp_path):
     export = write_masks(load_capture(capture_folder), tmp_path / "export", flat_name)
     (export / "train/_classes.csv").unlink()
