@@ -338,7 +338,7 @@ def _read_masks(path: Path, files: Sequence[Path], pngs: Sequence[Path]) -> Anno
         blank = list(pool.map(lambda file: _is_blank(file, background), pngs))
     images = []
     for file in (file for file, nothing in zip(pngs, blank, strict=True) if not nothing):
-        name = _MARK.sub(".png", file.relative_to(path).as_posix())
+        name = file.relative_to(path).with_name(_MARK.sub(".png", file.name)).with_suffix("").as_posix()
         images.append(AnnotatedImage(file, name, image_size(file), _Mask(file, place, tuple(named))))
     return Annotations("masks", tuple(named.values()), tuple(images))
 

@@ -84,7 +84,8 @@ def import_labels(path: Path, labels: Path) -> LabelImport:
 
     An image of the export belongs to the frame of the same stem, or of the same path joined in any way (Roboflow's
     `state_00_0001_jpg.rf.<hash>.jpg`, Label Studio's `<hash>-state_00_0001.jpg` to `state_00/images/0001.jpg`); where
-    states have frames of one stem, a folder of the export named after the state tells them apart. The classes that the
+    states have frames of one stem, a folder of the export named after the state tells them apart, and in one state the
+    suffix does. The classes that the
     capture declares keep their ids, others follow in the export's order. Frames that the export does not label stay as
     they are; where their labels' parts have no names, new classes are refused.
 
@@ -228,18 +229,20 @@ def _match(capture: Capture, labels: Path, annotations: Annotations) -> tuple[li
     matches: dict[int, _Match] = {}
     unmatched = []
     for image in annotations.images:
-        path = _exported_path(image.name)
+        path, suffix = _exported_path(image.name)
         keys = [_key(text) for p in (path, _without_prefix(path)) for text in (str(p), p.name)]
         found = next((named[key] for key in keys if key in named), [])
         if len(found) > 1:
             found = [(s, f) for s, f in found if s.name in path.parts] or found
+        if len({s.name for s, _ in found}) == 1:
+            found = [(s, f) for s, f in found if f.image.suffix.lower() == suffix] or found
         if len(found) > 1:
             (a, first), (b, second) = found[:2]
-            raise CaptureError(
-                image.file,
-                f"{image.name!r} may be {a.name}/{first.name} or {b.name}/{second.name}",
-                f"put the labels of each state into a folder named after it, {a.name} for instance",
-            )
+            found = f"{image.name!r} may be {a.name}/{first.name} or {b.name}/{second.name}"
+            mend = f"put the labels of each state into a folder named after it, {a.name} for instance"
+            if a is b:
+                mend = "give the two images names of their own, in the capture and in the export"
+            raise CaptureError(image.file, found, mend)
         if not found:
             unmatched.append(image.name)
             continue
@@ -271,18 +274,18 @@ def _key(name: str) -> str:
     return re.sub(r"[\W_]+", "_", name.lower()).strip("_")
 
 
-def _exported_path(name: str) -> PurePosixPath:
-    """The path of an exported image without what tools append: `a/x_jpg.rf.<hash>.jpg`, `a\\x.jpg` and
-    `http://a/x.jpg?token=...` are `a/x`."""
+def _exported_path(name: str) -> tuple[PurePosixPath, str]:
+    """The path of an exported image without what tools append, and the suffix that it had, "" where none is told:
+    `a/x_jpg.rf.<hash>.png`, `a\\x.jpg` and `http://a/x.jpg?token=...` are `a/x` and `.jpg`."""
     name = _QUERY.sub(r"\1", name)
     if re.search("[a-z]{2,}:/", name):
         name = unquote(name)
-    path = PurePosixPath(name.replace("\\", "/"))
+    path, suffix = PurePosixPath(name.replace("\\", "/")), ""
     if path.suffix.lower() in IMAGE_SUFFIXES:
-        path = path.with_suffix("")
-    if found := re.fullmatch(r"(.+?)(_(png|jpe?g|webp|bmp|tiff?))?\.rf\.\w+", path.name, flags=re.IGNORECASE):
-        path = path.parent / found[1]
-    return path
+        path, suffix = path.with_suffix(""), path.suffix.lower()
+    if found := re.fullmatch(r"(.+?)(?:_(png|jpe?g|webp|bmp|tiff?))?\.rf\.\w+", path.name, flags=re.IGNORECASE):
+        path, suffix = path.parent / found[1], f".{found[2].lower()}" if found[2] else ""
+    return path, suffix
 
 
 def _without_prefix(path: PurePosixPath) -> PurePosixPath:

@@ -377,6 +377,40 @@ def test_a_split_without_annotations_labels_nothing(capture_folder, tmp_path, ed
     assert import_labels(capture_folder, tmp_path / "export").labelled == 16
 
 
+def two_of_one_stem(capture_folder):
+    """The second frame's image becomes a JPEG that is called as the first's, and its labels other ones."""
+    images = capture_folder / "state_00/images"
+    cv2.imwrite(str(images / "0000.jpg"), cv2.imread(str(images / "0001.png")))
+    text = (capture_folder / "state_00/transforms.json").read_text()
+    (capture_folder / "state_00/transforms.json").write_text(text.replace("images/0001.png", "images/0000.jpg"))
+    cv2.imwrite(str(capture_folder / "state_00/labels/0001.png"), np.ones((16, 16), np.uint8))
+    return load_capture(capture_folder)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda c, out: write_coco(c, out / "labels.json", "runs"),
+        lambda c, out: write_coco(c, out / "labels.json", "runs", roboflow_name),
+        write_masks,
+    ],
+)
+def test_suffixes_tell_images_of_one_stem_apart(capture_folder, tmp_path, write):
+    capture = two_of_one_stem(capture_folder)
+    truth = all_labels(capture_folder)
+    export = write(capture, tmp_path / "export")
+    without_labels(capture_folder)
+    import_labels(capture_folder, export)
+    assert all_labels(capture_folder) == truth
+
+
+@pytest.mark.parametrize("write", [write_yolo, lambda c, out: write_masks(c, out, flat_name)])
+def test_images_of_one_stem_that_an_export_does_not_tell_apart_need_other_names(capture_folder, tmp_path, write):
+    export = write(two_of_one_stem(capture_folder), tmp_path / "export")
+    with pytest.raises(InputError, match=r"may be state_00/images/0000.jpg or state_00/images/0000.png; give the two"):
+        import_labels(capture_folder, export)
+
+
 def test_images_without_a_frame_are_told(capture_folder, tmp_path, edit):
     export = write_coco(load_capture(capture_folder), tmp_path / "labels.json", "runs")
     edit(export, lambda e: e["images"][0].update(file_name="elsewhere.png"))
