@@ -30,6 +30,8 @@ _MARK = re.compile(r"[._-](mask|label|seg)s?\.png$", re.IGNORECASE)
 """How masks' names end where they lie beside the images."""
 _IMAGE_FOLDERS = {"images", "image", "imgs", "img", "rgb", "JPEGImages"}
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+_Names = dict[int, str]
+"""A list of classes: names by their numbers, lines or pixel values."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,19 @@ class Annotations:
 
     format: str
     classes: tuple[str, ...]
+    """Those that something is labelled as."""
     images: tuple[AnnotatedImage, ...]
+
+
+@dataclass(frozen=True)
+class _Split:
+    """What one list of classes is for: an export, or its train, valid and test, or one state's."""
+
+    classes: tuple[str, ...]
+    """All that the list names."""
+    used: frozenset[str]
+    images: tuple[AnnotatedImage, ...]
+    """Drawn by the classes' places in the list."""
 
 
 def read_annotations(path: Path) -> Annotations:
@@ -66,7 +80,9 @@ def read_annotations(path: Path) -> Annotations:
       `x_mask.png`, and what lies in a folder of images beside one of masks, is none.
 
     An image without a shape, or whose mask holds the background alone, is not labelled; later shapes cover earlier
-    ones. Nothing outside the folder is opened. Hidden files, and other JSON beside COCO files, are passed over.
+    ones. A class that nothing is labelled as is left out. Where train, valid and test, or states, have lists of classes
+    of their own, one of these must name all classes that are used. Nothing outside the folder is opened. Hidden files,
+    and other JSON beside COCO files, are passed over.
 
     Raises `InputError` for anything else.
     """
@@ -84,7 +100,7 @@ def _read(path: Path) -> Annotations:
             raise CaptureError(path, "it is one file of many", "give the folder that holds data.yaml or classes.txt")
         if _is_json_list(path):
             raise CaptureError(path, _NOT_COCO, _AS_COCO)
-        return _read_coco(path.parent, path, read_json(path))
+        return _merged("COCO", [_read_coco(path.parent, path, read_json(path))])
     if not path.is_dir():
         raise CaptureError(path, "there are no labels here", "give the file or the folder that the tool exported")
     files = sorted(
@@ -93,12 +109,15 @@ def _read(path: Path) -> Annotations:
     jsons = [f for f in files if f.suffix == ".json"]
     objects = [(f, read_json(f)) for f in jsons if not _is_json_list(f)]
     if coco := [(f, content) for f, content in objects if "annotations" in content and "images" in content]:
-        return _merged([_read_coco(path, f, content) for f, content in coco])
+        return _merged("COCO", [_read_coco(path, f, content) for f, content in coco])
     if texts := _yolo_texts(path, files):
-        return _read_yolo(path, files, texts)
+        lists = _yolo_classes(path, files)
+        return _merged("YOLO", [_read_yolo(path, files, named, some) for named, some in _by_list(lists, texts)])
     pngs = [f for f in files if f.suffix.lower() == ".png"]
     if pngs and (not jsons or any(f.name in _MASK_CLASS_LISTS for f in files)):
-        return _read_masks(path, files, pngs)
+        lists = _mask_classes(path, files)
+        masks = _by_list(lists, _masks_among(path, pngs))
+        return _merged("masks", [_read_masks(path, named, some) for named, some in masks])
     if jsons:
         raise CaptureError(jsons[0], _NOT_COCO, _AS_COCO)
     raise CaptureError(
@@ -118,20 +137,51 @@ def _is_json_list(file: Path) -> bool:
     return read_text(file).lstrip().startswith("[")
 
 
-def _merged(exports: Sequence[Annotations]) -> Annotations:
-    """Files of one project (train, valid, test, or one a state); those that label images must have the same classes."""
-    exports = [export for export in exports if export.images] or exports[:1]
-    for export in exports[1:]:
-        if export.classes != exports[0].classes:
-            first, other = exports[0].images[0].file, export.images[0].file
-            raise CaptureError(other, f"its classes differ from those of {first}", "import one export at a time")
-    return replace(exports[0], images=tuple(image for export in exports for image in export.images))
+def _by_list(lists: Sequence[tuple[Path, _Names]], files: Sequence[Path]) -> list[tuple[_Names, list[Path]]]:
+    """The lists of classes, each with the files that it is for: those in its folder or below. Lists that say the same
+    are one, for all files."""
+    first, named = lists[0]
+    if all(other == named for _, other in lists):
+        return [(named, list(files))]
+    folders: dict[Path, tuple[_Names, list[Path]]] = {}
+    for file, named in lists:
+        if folders.setdefault(file.parent, (named, []))[0] != named:
+            raise CaptureError(file, f"its classes differ from those of {first}", "keep one of the two")
+    for file in files:
+        folder = next((folder for folder in file.parents if folder in folders), None)
+        if folder is None:
+            found = f"its classes may be those of {first} or of {lists[-1][0]}"
+            raise CaptureError(file, found, "put the list beside the labels, or import one export at a time")
+        folders[folder][1].append(file)
+    return [(named, some) for named, some in folders.values() if some]
+
+
+def _merged(format: str, splits: Sequence[_Split]) -> Annotations:
+    """One export of its splits, which must agree on the classes that they use; the others are left out."""
+    splits = [split for split in splits if split.images]
+    used = frozenset().union(*(split.used for split in splits))
+    whole = next((split.classes for split in splits if used <= {*split.classes}), None)
+    if splits and whole is None:
+        first = splits[0]
+        other = next(split for split in splits if not split.used <= {*first.classes})
+        found = f"its class {show(min(other.used - {*first.classes}))} is none of those of {first.images[0].file}"
+        raise CaptureError(other.images[0].file, found, "name the classes alike, or import one export at a time")
+    classes = tuple(name for name in whole or () if name in used)
+    images = []
+    for split in splits:
+        place = np.array([0, *(classes.index(name) + 1 if name in used else 0 for name in split.classes)], np.uint16)
+        images += [replace(image, draw=_renumbered(image.draw, place)) for image in split.images]
+    return Annotations(format, classes, tuple(images))
+
+
+def _renumbered(draw: Callable[[int, int], np.ndarray], place: np.ndarray) -> Callable[[int, int], np.ndarray]:
+    return lambda width, height: place[draw(width, height)]
 
 
 # ---------------------------------------------------------------------------------------------- COCO
 
 
-def _read_coco(root: Path, file: Path, content: dict[str, Any]) -> Annotations:
+def _read_coco(root: Path, file: Path, content: dict[str, Any]) -> _Split:
     def objects(key: str) -> Iterator[dict[str, Any]]:
         values = content.get(key)
         if not isinstance(values, list):
@@ -155,14 +205,11 @@ def _read_coco(root: Path, file: Path, content: dict[str, Any]) -> Annotations:
         image = field(annotation, "image_id", int, "an annotation")
         drawn.setdefault(image, []).append((category, annotation.get("segmentation")))
     named = {c["id"]: field(c, "name", str, f"category {c['id']}") for c in categories}
-    # Roboflow puts the project's name before the classes, as the category that they belong to.
-    above = [c.get("supercategory") for c in categories if c.get("supercategory") != c["name"]]
-    named = {i: name for i, name in named.items() if i in used or name not in above}
     place = {i: k for k, i in enumerate(named, start=1)}
     if unknown := used - set(place):
         raise CaptureError(file, f"category_id {min(unknown)} is in no category", "export the labels again")
     if drawn:
-        _check_classes(file, list(named.values()))
+        _check_classes(file, [named[i] for i in used])
 
     images = []
     for image in objects("images"):
@@ -175,7 +222,7 @@ def _read_coco(root: Path, file: Path, content: dict[str, Any]) -> Annotations:
             images.append(AnnotatedImage(file, path, (width, height), _CocoShapes(file, path, shapes)))
     if drawn:
         raise CaptureError(file, f"image_id {min(drawn)} of an annotation is no image's", "export the labels again")
-    return Annotations("COCO", tuple(named.values()), tuple(images))
+    return _Split(tuple(named.values()), frozenset(named[i] for i in used), tuple(images))
 
 
 @dataclass(frozen=True)
@@ -248,13 +295,11 @@ def _is_yolo(line: str) -> bool:
         return False
 
 
-def _read_yolo(path: Path, files: Sequence[Path], texts: Sequence[Path]) -> Annotations:
-    names = _yolo_classes(path, files)
-    numbers = [number for number, name in enumerate(names) if name]
-    classes = _check_classes(path, [names[number] for number in numbers])
-    place = {number: k for k, number in enumerate(numbers, start=1)}
+def _read_yolo(path: Path, files: Sequence[Path], named: _Names, texts: Sequence[Path]) -> _Split:
+    place = {number: k for k, number in enumerate(named, start=1)}
     pictures = {f.with_suffix(""): f for f in files if f.suffix.lower() in IMAGE_SUFFIXES}
     images = []
+    used = set()
     for file in texts:
         shapes = list(_yolo_shapes(file, place))
         if shapes:
@@ -263,10 +308,13 @@ def _read_yolo(path: Path, files: Sequence[Path], texts: Sequence[Path]) -> Anno
             beside = path.joinpath(*["images" if part == "labels" else part for part in name.parts])
             picture = pictures.get(beside) or pictures.get(path / name)
             images.append(AnnotatedImage(file, name.as_posix(), picture and image_size(picture), _YoloShapes(shapes)))
-    return Annotations("YOLO", tuple(classes), tuple(images))
+            used.update(value for value, _ in shapes)
+    classes = tuple(named.values())
+    return _Split(classes, frozenset(classes[value - 1] for value in used), tuple(images))
 
 
-def _yolo_classes(path: Path, files: Sequence[Path]) -> list[str]:
+def _yolo_classes(path: Path, files: Sequence[Path]) -> list[tuple[Path, _Names]]:
+    """The lists of classes, each with the names by their numbers."""
     found = []
     for file in (f for f in files if f.name in _CLASS_YAMLS):
         content = read_yaml(file)
@@ -276,23 +324,19 @@ def _yolo_classes(path: Path, files: Sequence[Path]) -> list[str]:
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise CaptureError(file, f"names is {show(names)}", "list the classes' names")
         found.append((file, names))
-    return _the_one(found) if found else _listed_classes(path, files, "data.yaml or classes.txt")
+    lists = found or _listed_classes(path, files, "data.yaml or classes.txt")
+    named = [(file, {number: name for number, name in enumerate(names) if name}) for file, names in lists]
+    for file, names in named:
+        _check_classes(file, list(names.values()))
+    return named
 
 
-def _listed_classes(path: Path, files: Sequence[Path], wanted: str) -> list[str]:
-    """The names by their lines, "" where one is empty."""
+def _listed_classes(path: Path, files: Sequence[Path], wanted: str) -> list[tuple[Path, list[str]]]:
+    """The lists of classes, each with the names by their lines, "" where one is empty."""
     lists = [f for f in files if f.name in _CLASS_LISTS]
     if not lists:
         raise CaptureError(path, "the names of the classes are missing", f"put the export's {wanted} beside the labels")
-    return _the_one([(f, [line.strip() for line in read_text(f).rstrip().splitlines()]) for f in lists])
-
-
-def _the_one(found: Sequence[tuple[Path, Any]]) -> Any:
-    """What all files say of the classes."""
-    for file, classes in found[1:]:
-        if classes != found[0][1]:
-            raise CaptureError(file, f"its classes differ from those of {found[0][0]}", "import one export at a time")
-    return found[0][1]
+    return [(f, [line.strip() for line in read_text(f).rstrip().splitlines()]) for f in lists]
 
 
 def _yolo_shapes(file: Path, place: dict[int, int]) -> Iterator[tuple[int, np.ndarray]]:
@@ -327,20 +371,19 @@ class _YoloShapes:
 # ---------------------------------------------------------------------------------------------- mask PNGs
 
 
-def _read_masks(path: Path, files: Sequence[Path], pngs: Sequence[Path]) -> Annotations:
-    named = _mask_classes(path, files)
-    pngs = _masks_among(path, pngs)
-    place = np.zeros(max(UNLABELLED, *named) + 1, np.uint16)
+def _read_masks(path: Path, named: _Names, pngs: Sequence[Path]) -> _Split:
+    place = np.zeros(max(named) + 1, np.uint16)
     for k, value in enumerate(named, start=1):
         place[value] = k
-    background = [value for value, name in named.items() if name.lower() in BACKGROUND_NAMES]
+    background = {value for value, name in named.items() if name.lower() in BACKGROUND_NAMES}
     with ThreadPoolExecutor() as pool:
-        blank = list(pool.map(lambda file: _is_blank(file, background), pngs))
+        found = list(pool.map(_mask_values, pngs))
     images = []
-    for file in (file for file, nothing in zip(pngs, blank, strict=True) if not nothing):
+    for file in (file for file, values in zip(pngs, found, strict=True) if values is None or values - background):
         name = file.relative_to(path).with_name(_MARK.sub(".png", file.name)).with_suffix("").as_posix()
         images.append(AnnotatedImage(file, name, image_size(file), _Mask(file, place, tuple(named))))
-    return Annotations("masks", tuple(named.values()), tuple(images))
+    used = set().union(*(values for values in found if values is not None))
+    return _Split(tuple(named.values()), frozenset(named[value] for value in used & {*named}), tuple(images))
 
 
 def _masks_among(path: Path, pngs: Sequence[Path]) -> Sequence[Path]:
@@ -350,28 +393,27 @@ def _masks_among(path: Path, pngs: Sequence[Path]) -> Sequence[Path]:
     return marked or [f for f in pngs if not _IMAGE_FOLDERS & {*f.relative_to(path).parts[:-1]}] or pngs
 
 
-def _is_blank(file: Path, background: Sequence[int]) -> bool:
-    """Whether a mask holds the background alone. One that cannot be read is no such mask: drawing it says why."""
+def _mask_values(file: Path) -> set[int] | None:
+    """The values of a mask's pixels. One that cannot be read has None: drawing it says why."""
     try:
-        return bool(np.isin(read_labels(file), background).all())
+        return {*np.unique(read_labels(file)).tolist()}
     except CaptureError:
-        return False
+        return None
 
 
-def _mask_classes(path: Path, files: Sequence[Path]) -> dict[int, str]:
-    """The names of the pixel values; 0 and 255, where they have none, are the background and what is unlabelled."""
-    found = [(file, _csv_classes(file)) for file in files if file.name == "_classes.csv"]
-    if found:
-        named = _the_one(found)
-    elif colours := [file for file in files if file.name == "labelmap.txt"]:
+def _mask_classes(path: Path, files: Sequence[Path]) -> list[tuple[Path, _Names]]:
+    """The lists of classes, each with the names by the pixel values; where 0 and 255 have none, they are the background
+    and what is unlabelled."""
+    lists = [(file, _csv_classes(file)) for file in files if file.name == "_classes.csv"]
+    if not lists and (colours := [file for file in files if file.name == "labelmap.txt"]):
         found = "its masks hold colours, as CVAT's Segmentation mask has them"
         raise CaptureError(colours[0], found, "export the labels as COCO 1.0")
-    else:
-        names = _listed_classes(path, files, "_classes.csv or classes.txt")
+    for file, names in [] if lists else _listed_classes(path, files, "_classes.csv or classes.txt"):
         start = 0 if names and names[0].lower() in BACKGROUND_NAMES else 1
-        named = {value: name for value, name in enumerate(names, start=start) if name}
-    _check_classes(path, list(named.values()))
-    return {0: BACKGROUND_NAMES[0], UNLABELLED: UNLABELLED_NAMES[0], **named}
+        lists.append((file, {value: name for value, name in enumerate(names, start=start) if name}))
+    for file, named in lists:
+        _check_classes(file, list(named.values()))
+    return [(file, {0: BACKGROUND_NAMES[0], UNLABELLED: UNLABELLED_NAMES[0], **named}) for file, named in lists]
 
 
 def _csv_classes(file: Path) -> dict[int, str]:

@@ -369,6 +369,63 @@ def test_line_numbers_of_a_list_of_classes_stay_where_lines_are_empty(capture_fo
     assert all_labels(capture_folder) == truth
 
 
+def coco_split(capture, folder, names):
+    file = write_coco(capture, folder / "_annotations.coco.json", "runs")
+    content = json.loads(file.read_text())
+    numbers = {part: number for number, part in capture.parts.items()}
+    moved = {numbers.get(name, 90): number for number, name in enumerate(names, start=1)}
+    content["categories"] = [{"id": number, "name": name} for number, name in enumerate(names, start=1)]
+    for annotation in content["annotations"]:
+        annotation["category_id"] = moved[annotation["category_id"]]
+    file.write_text(json.dumps(content))
+
+
+def yolo_split(capture, folder, names):
+    write_yolo(capture, folder)
+    (folder / "data.yaml").write_text(f"names: {json.dumps(names)}\n")
+    for file in folder.glob("train/labels/*.txt"):
+        lines = [line.partition(" ") for line in file.read_text().splitlines()]
+        numbers = [names.index(capture.parts[int(number) + 1]) for number, _, _ in lines]
+        file.write_text("\n".join(f"{n} {rest}" for n, (_, _, rest) in zip(numbers, lines, strict=True)))
+
+
+def mask_split(capture, folder, names):
+    write_masks(capture, folder, flat_name)
+    rows = [f"{number}, {name}" for number, name in enumerate(names, start=1)]
+    (folder / "train/_classes.csv").write_text("\n".join(rows) + "\n")
+    for file in folder.glob("train/*_mask.png"):
+        labels = read_labels(file)
+        numbers = np.array([0, *(names.index(part) + 1 for part in capture.parts.values())], np.uint8)
+        cv2.imwrite(str(file), numbers[labels])
+
+
+def write_splits(path, tmp_path, write, lists):
+    capture = load_capture(path)
+    for split, state, names in zip(("train", "valid"), capture.states, lists, strict=True):
+        write(dataclasses.replace(capture, states=(state,)), tmp_path / "export" / split, names)
+    return tmp_path / "export"
+
+
+@pytest.mark.parametrize("write", [coco_split, yolo_split, mask_split])
+def test_splits_need_the_same_classes_only_where_they_are_used(capture_folder, tmp_path, write):
+    truth = all_labels(capture_folder)
+    lists = ["base", "door"], ["hinge", "door", "base", "handle"]
+    export = write_splits(capture_folder, tmp_path, write, lists)
+    without_labels(capture_folder)
+    assert import_labels(capture_folder, export).parts == ("base", "door")
+    assert all_labels(capture_folder) == truth
+
+
+@pytest.mark.parametrize("write", [coco_split, yolo_split, mask_split])
+def test_splits_whose_used_classes_have_other_names_are_refused(capture_folder, tmp_path, write):
+    def renamed(capture, folder, names):
+        write(dataclasses.replace(capture, parts=dict(enumerate(names, start=1))), folder, names)
+
+    export = write_splits(capture_folder, tmp_path, renamed, (["base", "door"], ["base", "lid"]))
+    with pytest.raises(InputError, match=r"export/valid/.*: its class 'lid' is none of those of .*export/train/"):
+        import_labels(capture_folder, export)
+
+
 @pytest.mark.parametrize("categories", [{}, {"categories": []}])
 def test_a_split_without_annotations_labels_nothing(capture_folder, tmp_path, edit, categories):
     for split in ("train", "valid"):
