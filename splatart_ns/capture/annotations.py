@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from splatart_ns.capture.capture import UNLABELLED, CaptureError
-from splatart_ns.capture.images import MAX_LABEL, image_size, read_labels
+from splatart_ns.capture.images import MAX_LABEL, image_size, orientation, read_labels
 from splatart_ns.capture.rasters import decode_runs, decompress_runs, fill_polygon
 from splatart_ns.capture.values import is_inside, parse_number, read_json, read_text, read_yaml, show
 
@@ -307,10 +307,16 @@ def _read_yolo(path: Path, files: Sequence[Path], named: _Names, texts: Sequence
             name = file.relative_to(path).with_suffix("")
             beside = path.joinpath(*["images" if part == "labels" else part for part in name.parts])
             picture = pictures.get(beside) or pictures.get(path / name)
-            images.append(AnnotatedImage(file, name.as_posix(), picture and image_size(picture), _YoloShapes(shapes)))
+            images.append(AnnotatedImage(file, name.as_posix(), picture and _shown_size(picture), _YoloShapes(shapes)))
             used.update(value for value, _ in shapes)
     classes = tuple(named.values())
     return _Split(classes, frozenset(classes[value - 1] for value in used), tuple(images))
+
+
+def _shown_size(picture: Path) -> tuple[int, int]:
+    """Width and height as annotation tools show a picture."""
+    width, height = image_size(picture)
+    return (width, height) if orientation(picture) < 5 else (height, width)
 
 
 def _yolo_classes(path: Path, files: Sequence[Path]) -> list[tuple[Path, _Names]]:

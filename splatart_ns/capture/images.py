@@ -15,6 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.ExifTags
 import PIL.Image
 
 from splatart_ns.capture.capture import UNLABELLED, Camera, CaptureError
@@ -154,6 +155,25 @@ def image_size(path: Path) -> tuple[int, int]:
         return width, height
     height, width = read_image(path).shape[:2]
     return width, height
+
+
+def orientation(path: Path) -> int:
+    """How an image's EXIF data ask to turn it: 1 not at all, 2 to 4 within its size, 5 to 8 on its side. Viewers and
+    annotation tools do; COLMAP, nerfstudio and `read_image` take the pixels as they are stored."""
+    exif = PIL.Image.Exif()
+    try:
+        with PIL.Image.open(path) as image:
+            exif.load(image.info.get("exif"))
+        turn = exif.get(PIL.ExifTags.Base.Orientation)
+    except Exception:  # Pillow lets whatever its parsers meet through
+        return 1
+    return turn if turn in range(1, 9) else 1
+
+
+def as_stored(shown: np.ndarray, turn: int) -> np.ndarray:
+    """Pixels [H, W] of an image that was turned on its side, as an `orientation` of 5 to 8 asks, before it was."""
+    stored = {5: shown.T, 6: np.rot90(shown), 7: np.rot90(shown.T, 2), 8: np.rot90(shown, -1)}
+    return np.ascontiguousarray(stored[turn])
 
 
 @lru_cache(maxsize=4096)

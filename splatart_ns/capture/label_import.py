@@ -26,7 +26,7 @@ from splatart_ns.capture.annotations import (
 )
 from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame, State
 from splatart_ns.capture.formats import SPLITS, TRANSFORMS, load_capture, load_states
-from splatart_ns.capture.images import MAX_LABEL, write_png
+from splatart_ns.capture.images import MAX_LABEL, as_stored, orientation, write_png
 from splatart_ns.capture.values import DISTORTION, is_inside, read_json, relative_path, show
 from splatart_ns.errors import InputError, printable
 from splatart_ns.files import new_folder, replacing_all, write_json
@@ -85,9 +85,10 @@ def import_labels(path: Path, labels: Path) -> LabelImport:
     An image of the export belongs to the frame of the same stem, or of the same path joined in any way (Roboflow's
     `state_00_0001_jpg.rf.<hash>.jpg`, Label Studio's `<hash>-state_00_0001.jpg` to `state_00/images/0001.jpg`); where
     states have frames of one stem, a folder of the export named after the state tells them apart, and in one state the
-    suffix does. The classes that the
-    capture declares keep their ids, others follow in the export's order. Frames that the export does not label stay as
-    they are; where their labels' parts have no names, new classes are refused.
+    suffix does. Labels of an image that EXIF data turn on its side are turned back; where their size does not tell
+    whether they are turned, they are refused. The classes that the capture declares keep their ids, others follow in
+    the export's order. Frames that the export does not label stay as they are; where their labels' parts have no names,
+    new classes are refused.
 
     Raises:
         InputError: anything that cannot be read or written; labels that fit no frame, or not the frames' sizes.
@@ -108,9 +109,10 @@ def import_labels(path: Path, labels: Path) -> LabelImport:
         raise CaptureError(kept, found, mend)
 
     def draw(match: _Match) -> np.ndarray:
-        camera, image = match.frame.camera, match.image
-        drawn = image.draw(camera.width, camera.height)
-        return ids[drawn]
+        size = match.frame.camera.width, match.frame.camera.height
+        if match.turn is None:
+            return ids[match.image.draw(*size)]
+        return as_stored(ids[match.image.draw(*size[::-1])], match.turn)
 
     taken = _files_that_stay(path, metas, labelled)
     for match in matches:
@@ -209,6 +211,8 @@ class _Match:
     frame: Frame
     root: Path
     """The folder that the frame's paths start from."""
+    turn: int | None = None
+    """The frame's `orientation`, if the labels are those of the turned image."""
     file: Path = Path()
     """Where its labels go."""
 
@@ -262,11 +266,19 @@ def _check_match(match: _Match, other: _Match | None) -> None:
     if other is not None:
         found = f"{other.image.name!r} and {image.name!r} both label the frame {frame.name}"
         raise CaptureError(image.file, found, "export every image once, without augmentation")
-    if image.size is not None and image.size != (frame.camera.width, frame.camera.height):
+    stored = frame.camera.width, frame.camera.height
+    turn = orientation(frame.image)
+    shown = stored[::-1] if turn >= 5 else stored
+    if turn > 1 and (image.size is None or shown == stored):
+        found = f"EXIF data turn it (orientation {turn}), and {image.name!r} may be labelled so or as it is stored"
+        raise CaptureError(frame.image, found, "take the orientation out of the file, and label what it then shows")
+    if image.size not in (None, stored, shown):
         found = "{!r} is {}x{} pixels".format(image.name, *image.size)
         size = f"{frame.camera.width}x{frame.camera.height}"
         mend = f"export it at the size of the frame {frame.name}, {size}, without resizing"
         raise CaptureError(image.file, found, mend)
+    if image.size == shown != stored:
+        match.turn = turn
 
 
 def _key(name: str) -> str:
