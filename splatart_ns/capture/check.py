@@ -65,6 +65,8 @@ def check_structure(path: Path) -> tuple[Capture | None, list[Problem]]:
     return capture, list(dict.fromkeys(problems))
 
 
+_INVERTED = 0.9
+"""Silhouettes are inverted if they leave out more than this share of all labelled pixels."""
 _NO_PIXELS = np.zeros(256, int)
 
 
@@ -77,6 +79,8 @@ class _Content:
     """Number of pixels of each label [256]."""
     silhouette: float | None = None
     """The part of the image inside the silhouette, if the frame has one."""
+    left_out: int = 0
+    """Number of pixels that are labelled as a part, but lie outside the silhouette."""
     masked_out: bool = False
     """Whether the mask leaves no pixel to the loss."""
 
@@ -110,6 +114,8 @@ def _look(frame: Frame, parts: dict[int, str]) -> _Content:
     labels = read(frame.labels, read_labels)
     if labels is not None:
         content.pixels = np.bincount(labels.ravel(), minlength=256)
+        if silhouette is not None:
+            content.left_out = int(((labels > 0) & (labels != UNLABELLED) & (silhouette <= 127)).sum())
         unknown = [i for i in np.flatnonzero(content.pixels[:UNLABELLED]) if i > 0 and i not in parts]
         if unknown:
             message = f"the label {unknown[-1]} is none of the declared parts 1 to {max(parts, default=0)}"
@@ -167,6 +173,12 @@ def _check_silhouettes(capture: Capture, state: State, contents: list[_Content])
         found = "all silhouettes fill their images, so the background counts as the object"
         mend = "give silhouettes by object_mask_path, or images without alpha"
         yield Problem("warning", capture.path / state.name, found, mend)
+    labelled = sum(int(c.pixels[1:UNLABELLED].sum()) for c in contents if c.silhouette)
+    left_out = sum(content.left_out for content in contents if content.silhouette)
+    if left_out > _INVERTED * labelled:
+        found = f"the silhouettes leave out {left_out / labelled:.0%} of what is labelled as parts"
+        mend = "invert them: the object must be opaque, or white in object_mask_path, and what surrounds it not"
+        yield Problem("error", capture.path / state.name, found, mend)
 
 
 def _check_points(state: State) -> Iterator[Problem]:

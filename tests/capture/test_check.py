@@ -135,6 +135,24 @@ def test_only_empty_silhouettes_are_an_error(capture_folder):
     assert found(check_capture(capture_folder)) == ["state_00: all silhouettes are empty"]
 
 
+def invert(file):
+    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    image[..., 3] = 255 - image[..., 3]
+    put(file, image)
+
+
+def test_inverted_silhouettes_are_an_error_where_labels_tell(capture_folder, edit):
+    files = sorted((capture_folder / "state_01/images").iterdir())
+    invert(files[0])
+    assert found(check_capture(capture_folder)) == []  # which may be this frame's labels' fault
+    for file in files[1:]:
+        invert(file)
+    edit(capture_folder / "state_01/transforms.json", lambda m: [e.pop("semantics_path") for e in m["frames"][2:]])
+    assert found(check_capture(capture_folder)) == [
+        "state_01: the silhouettes leave out 100% of what is labelled as parts"
+    ]
+
+
 def test_opaque_images_are_told_from_silhouettes(capture_folder, edit):
     for file in (capture_folder / "state_00/images").iterdir():
         put(file, np.full((16, 16, 4), 255, np.uint8))
