@@ -338,16 +338,19 @@ def _check_coverage(capture: Capture, one: _Evidence) -> Iterator[Problem]:
 
 def _in_place(a: _Evidence, b: _Evidence, num_parts: int) -> Tensor:
     """How much of each part [P + 1] of state a is at the same place in the labels of b, as a share of what is so in
-    those of a; NaN where few points are seen."""
+    those of a; NaN where few points are seen. What lies behind the surface of b may be there, hidden by a part that
+    moved before it, and does not count."""
     part = a.votes.parts()
-    there = read_ballots(b.labelled, *a.points_in(b), num_parts)
+    points, size = a.points_in(b)
+    there = read_ballots(b.labelled, torch.cat([points, b.points]), max(size, b.size), num_parts)
     right, number = torch.zeros(2, num_parts + 1), torch.zeros(2, num_parts + 1)
     for k, ballots in enumerate((a.votes.ballots, there)):
         for ballot in ballots:
-            own = part[ballot.points]
-            agrees = ballot.near[own, torch.arange(len(own))]
-            right[k] += torch.bincount(own, agrees.float(), num_parts + 1)
-            number[k] += torch.bincount(own, minlength=num_parts + 1)
+            own = ballot.points < len(points)
+            told = part[ballot.points[own]]
+            agrees = ballot.near[:, own][told, torch.arange(len(told))]
+            right[k] += torch.bincount(told, agrees.float(), num_parts + 1)
+            number[k] += torch.bincount(told, minlength=num_parts + 1)
     share = right / number
     return torch.where((number >= _ENOUGH_POINTS).all(0), share[1] / share[0], math.nan)
 
@@ -357,15 +360,17 @@ def _check_motion(capture: Capture, first: _Evidence, other: _Evidence) -> Itera
         return
     parts = list(capture.parts)
     both = torch.stack([_in_place(first, other, max(parts)), _in_place(other, first, max(parts))])[:, parts]
-    share = both.amin(0)  # a part that comes out of another is seen where it was, but was not where it is seen
-    known = share[share.isfinite()]
+    # The less, as a part that comes out of another is seen where it was, but was not where it is seen.
+    rest = both.amin(0)
+    moved = both.nan_to_num(math.inf).amin(0)
+    moved = moved[moved.isfinite()]
     place = capture.path / other.state.name
-    if len(known) == len(parts) > 1 and bool((known > _STAYS).all()):
+    if len(parts) > 1 and bool((rest > _STAYS).all()):
         found = f"no part seems to have moved since {first.state.name}"
         yield Problem(
             "warning", place, found, "show another configuration, or check the poses; a round part may have turned"
         )
-    if len(known) and bool((known < _MOVES).all()):
+    if 2 * len(moved) > len(parts) and bool((moved < _MOVES).all()):
         found = f"no part is where it was in {first.state.name}: the states may have different worlds or labels"
         mend = f"{OTHER_WORLDS_MEND}, or correct the ids of the parts"
         yield Problem("warning", place, found, mend)
