@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +61,11 @@ def check_structure(path: Path) -> tuple[Capture | None, list[Problem]]:
             problems.append(Problem("error", capture.path / state.name, found, mend))
         problems.extend(_check_points(state))
     pixels = [sum((by_frame[id(f)].pixels for f in s.split("train")), np.zeros(256, int)) for s in capture.states]
-    problems.extend(_check_labels(capture, np.array(pixels)))
+    gaps = _gaps(capture, contents)
+    if gaps:
+        problems.append(_gap_problem(capture, np.array(pixels), gaps))
+    named = replace(capture, parts={i: name for i, name in capture.parts.items() if i not in gaps})
+    problems.extend(_check_labels(named, np.array(pixels)))
     return capture, list(dict.fromkeys(problems))
 
 
@@ -187,6 +191,24 @@ def _check_points(state: State) -> Iterator[Problem]:
             load_points(state.points, Normalization(np.zeros(3), 1.0))
         except CaptureError as error:
             yield error.problem
+
+
+def _gaps(capture: Capture, contents: Sequence[_Content]) -> list[int]:
+    """The ids that no label file holds, below one that is there, where no `semantic_classes` give parts names."""
+    if any(name != f"part_{i}" for i, name in capture.parts.items()):
+        return []
+    held = sum((content.pixels for content in contents), _NO_PIXELS)
+    return [i for i in capture.parts if not held[i] and held[i:UNLABELLED].any()]
+
+
+def _gap_problem(capture: Capture, pixels: np.ndarray, gaps: Sequence[int]) -> Problem:
+    """An error unless all training frames are labelled, and two parts in two states, which are worth a fit."""
+    whole = all(frame.labels is not None for state in capture.states for frame in state.split("train"))
+    compared = int(((pixels[:, 1:UNLABELLED] > 0).sum(axis=0) > 1).sum())
+    missing = ", ".join(map(str, gaps[:3])) + (", ..." if len(gaps) > 3 else "")
+    found = f"the labels go up to {max(capture.parts)}, but none is {missing}"
+    mend = "number the parts 1, 2, ... without gaps, or correct stray pixels of large numbers"
+    return Problem("warning" if whole and compared > 1 else "error", capture.path, found, mend)
 
 
 def _check_labels(capture: Capture, pixels: np.ndarray) -> Iterator[Problem]:

@@ -213,6 +213,18 @@ def test_one_image_cannot_show_two_states(capture_folder, edit):
     assert ["in state_00 and in state_01" in e for e in found(check_capture(capture_folder))] == [True]
 
 
+def test_numbers_that_labels_without_classes_leave_out_are_one_problem(capture_folder, edit):
+    for k in range(2):
+        relabel(capture_folder / f"state_0{k}", 2, 200)
+        edit(capture_folder / f"state_0{k}/transforms.json", lambda m: m.pop("semantic_classes"))
+    told = ["capture: the labels go up to 200, but none is 2, 3, 4, ..."]
+    problems = check_capture(capture_folder)
+    assert (found(problems), found(problems, "warning")) == ([], told)
+
+    edit(capture_folder / "state_01/transforms.json", lambda m: m["frames"][0].pop("semantics_path"))
+    assert found(check_capture(capture_folder)) == told  # that frame may show them
+
+
 def test_no_labels_at_all_is_one_error(capture_folder):
     for k in range(2):
         for i in (1, 2):
