@@ -209,7 +209,7 @@ def _read_coco(root: Path, file: Path, content: dict[str, Any]) -> _Split:
     if unknown := used - set(place):
         raise CaptureError(file, f"category_id {min(unknown)} is in no category", "export the labels again")
     if drawn:
-        _check_classes(file, [named[i] for i in used])
+        _check_classes(file, [name for i, name in named.items() if i in used])
 
     images = []
     for image in objects("images"):
