@@ -33,6 +33,7 @@ from splatart_ns.stages.semantic import (
     trusted,
     vote_logits,
 )
+from splatart_ns.stages.spread import TOLD, spread
 
 RefineCameras = Literal["auto", "on", "off"]
 HALF_SIZE = 0.4
@@ -342,13 +343,20 @@ class SemanticPipeline(VanillaPipeline):
             return
         self._has_voted = True
         frames, labelled = self.datamanager.train_dataset.metadata["frames"], sorted(self._labelled)
-        votes = ballots(self.model.splat.detach(), [self._views[i] for i in labelled], self.model.num_parts)
+        splat = self.model.splat.detach()
+        votes, shown = ballots(splat, [self._views[i] for i in labelled], self.model.num_parts)
         kept = trusted(votes)
         for i in (labelled[v] for v in (~kept).nonzero()[:, 0].tolist()):
             self.notes.append(f"{frames[i].labels}: contradicts the other frames' labels and is not used.")
             CONSOLE.log(self.notes[-1], markup=False)
         self._labelled = {labelled[v] for v in kept.nonzero()[:, 0].tolist()}
         self.model.trusted[sorted(self._labelled)] = True
-        if self.model.config.vote_init and step == self.model.config.semantic_start:
+        if not self.model.config.vote_init:
+            return
+        told = (shown[kept] >= TOLD).any(0)
+        semantics = self.model.gauss_params["semantics"]
+        # Adam makes steps as long of the faint gradients of what lies behind others.
+        semantics.register_hook(lambda gradient: gradient * told[:, None])
+        if step == self.model.config.semantic_start:
             with torch.no_grad():
-                self.model.gauss_params["semantics"].copy_(vote_logits(votes[kept]))
+                semantics.copy_(spread(splat, vote_logits(votes[kept]), told))

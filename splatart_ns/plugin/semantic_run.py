@@ -15,7 +15,7 @@ from splatart_ns.plugin.compat import finished_runs, read_checkpoint, run_settin
 from splatart_ns.plugin.gaussians import SPLAT_SHAPES, splat_from_state
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.exposure import at_gain
-from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
+from splatart_ns.stages.silhouette import rendered_silhouette, with_rendered_labels, with_silhouette
 
 _SHAPES = {
     "_model.cameras_refined": (),
@@ -56,6 +56,7 @@ def read_state(
         )
     views = [view.to(device) for view in learned_views(capture, state, checkpoint, downscale)]
     views = [with_silhouette(view) or rendered_silhouette(view, splat) for view in views]
+    views = [with_rendered_labels(view, splat) for view in views]
     return LabelledState(splat, views, bool(checkpoint["_model.cameras_refined"]))
 
 

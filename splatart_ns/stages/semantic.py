@@ -11,6 +11,7 @@ from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.view import View
 from splatart_ns.rasterize.render import Rendering, render
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.visibility import unobstructed
 
 WRONG_OBJECT = 0.6
 """A view's labels are wrong where it contradicts the others on so much of the object. Less would not do: of what is
@@ -50,13 +51,14 @@ def segmentation_loss(probabilities: Tensor, labels: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def ballots(splat: Splat, views: Sequence[View], num_parts: int) -> Tensor:
+def ballots(splat: Splat, views: Sequence[View], num_parts: int) -> tuple[Tensor, Tensor]:
     """How much of its labels' pixels each labelled view sees through each Gaussian [V, N, P + 1]: blending weights.
+    And the share of the Gaussian that it sees so [V, N]: 1 if nothing is before it, and all of it is labelled.
 
     The gradient of a rendering with respect to P + 1 zero feature channels is the sum of blending weights, so one
     backward pass a view counts its votes.
     """
-    cast = []
+    cast, shown = [], []
     for view in views:
         view = view.to(splat.means.device)
         labels = view.labels.long()
@@ -64,11 +66,17 @@ def ballots(splat: Splat, views: Sequence[View], num_parts: int) -> Tensor:
         target = torch.nn.functional.one_hot(torch.where(labelled, labels, 0), num_parts + 1).float()
         features = torch.zeros(len(splat), num_parts + 1, device=splat.means.device, requires_grad=True)
         with torch.enable_grad():
-            image = render(
+            rendering = render(
                 splat, view.viewmat[None], view.K[None], view.width, view.height, features=features, with_depth=False
-            ).features[0]
+            )
+            image = rendering.features[0]
             cast.append(torch.autograd.grad((image * target * labelled[..., None]).sum(), features)[0])
-    return torch.stack(cast) if cast else torch.zeros(0, len(splat), num_parts + 1, device=splat.means.device)
+        alone = unobstructed(splat, rendering)
+        shown.append(torch.where(alone > 0, cast[-1].sum(-1) / alone.clamp_min(1e-6), 0.0))
+    if not cast:
+        none = torch.zeros(0, len(splat), num_parts + 1, device=splat.means.device)
+        return none, none[..., 0]
+    return torch.stack(cast), torch.stack(shown)
 
 
 def trusted(votes: Tensor) -> Tensor:
@@ -99,6 +107,6 @@ def _contradiction(ballot: Tensor, others: Tensor) -> Tensor:
 
 def vote_logits(votes: Tensor) -> Tensor:
     """Part logits [N, P + 1] from ballots [V, N, P + 1]: the log share of each label. A Gaussian that no view sees gets
-    equal logits."""
+    equal logits (see `spread`)."""
     total = votes.sum(0) + 1e-3
     return (total / total.sum(-1, keepdim=True)).log()

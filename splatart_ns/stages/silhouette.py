@@ -1,4 +1,5 @@
-"""Where the object ends in opaque images: by their labels, or by a labelled splat of object and surroundings."""
+"""What images do not say: where the object ends in opaque ones, by their labels or a labelled splat, and which part is
+where in unlabelled ones."""
 
 from __future__ import annotations
 
@@ -34,3 +35,21 @@ def rendered_silhouette(view: View, splat: Splat) -> View:
     )
     share = 1 - part_image(rendering)[0, ..., 0]
     return replace(view, alpha=(255 * share.clamp(0, 1)).round().to(torch.uint8).to(view.rgb.device))
+
+
+SHOWN = 0.1
+"""Where a splat shows less than this of the object, it does not know what is there."""
+
+
+@torch.no_grad()
+def with_rendered_labels(view: View, splat: Splat) -> View:
+    """The view, which has an alpha, with the labels that a labelled splat shows where it has none of its own."""
+    if view.labels is not None:
+        return view
+    camera = view.viewmat[None].to(splat.means), view.K[None].to(splat.means)
+    rendering = render(
+        splat, *camera, view.width, view.height, features=splat.part_probabilities, with_depth=False, sh_degree=0
+    )
+    of_parts = part_image(rendering)[0, ..., 1:].to(view.rgb.device)
+    labels = torch.where(of_parts.sum(-1) >= SHOWN, of_parts.argmax(-1) + 1, UNLABELLED)
+    return replace(view, labels=labels.where(view.alpha > 0, 0).to(torch.uint8))

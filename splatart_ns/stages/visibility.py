@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.view import View
-from splatart_ns.rasterize.render import render
+from splatart_ns.rasterize.render import Rendering, render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.threads import side_by_side
 
@@ -47,7 +47,7 @@ def _contribution(splat: Splat, view: View) -> tuple[Tensor, Tensor]:
     """What each Gaussian contributes to a view [N], and what it would if nothing were before it [N], in pixels.
 
     The gradient of a rendering with respect to a feature channel is the sum of blending weights, so one backward pass
-    measures all Gaussians. Alone, a Gaussian has its opacity times the integral of exp(-x^T C x / 2), 2 pi / sqrt(|C|).
+    measures all Gaussians.
     """
     splat = splat.detach()
     device = splat.means.device
@@ -55,10 +55,18 @@ def _contribution(splat: Splat, view: View) -> tuple[Tensor, Tensor]:
     camera = view.viewmat[None].to(device), view.K[None].to(device)
     rendering = render(splat, *camera, view.width, view.height, features=feature, with_depth=False, sh_degree=0)
     contribution = torch.autograd.grad(rendering.features.sum(), feature)[0][:, 0]
+    return contribution, unobstructed(splat, rendering)
+
+
+def unobstructed(splat: Splat, rendering: Rendering) -> Tensor:
+    """What each Gaussian would contribute to the first image of a rendering [N], in pixels, if nothing were before it.
+
+    That is its opacity times the integral of exp(-x^T C x / 2), 2 pi / sqrt(|C|).
+    """
     a, b, c = rendering.info["conics"][0].detach().unbind(-1)
     drawn = rendering.info["radii"][0].reshape(len(splat), -1).amin(-1) > 0
-    alone = splat.opacities * 2 * math.pi / (a * c - b * b).clamp_min(1e-12).sqrt()
-    return contribution, torch.where(drawn, alone, 0.0)
+    alone = splat.opacities.detach() * 2 * math.pi / (a * c - b * b).clamp_min(1e-12).sqrt()
+    return torch.where(drawn, alone, 0.0)
 
 
 def shown(seen: Tensor, share: float = 0.98) -> Tensor:

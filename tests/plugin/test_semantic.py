@@ -12,6 +12,8 @@ from splatart_ns.plugin import semantic
 from splatart_ns.plugin.semantic_run import learned_views
 from splatart_ns.stages.camera_refinement import PASSES
 from splatart_ns.stages.hull import Slack
+from splatart_ns.stages.semantic import ballots
+from splatart_ns.stages.spread import TOLD, spread
 
 
 def test_growth_stops_at_the_limit(capture_dir, semantic_trainer):
@@ -70,6 +72,31 @@ def test_only_part_logits_learn_in_the_second_phase(capture_dir, semantic_traine
     trainer.train()
     changed = {name for name, p in model.gauss_params.items() if not torch.equal(p, held[name])}
     assert changed == {"semantics"}
+
+
+def test_gaussians_that_no_labelled_frame_shows_have_the_labels_of_those_beside_them(
+    capture_dir, semantic_trainer, monkeypatch
+):
+    """Here those with an even number; they also stay so while the others learn."""
+    told = {}
+
+    def ballots_of_odd_ones(splat, views, num_parts):
+        votes, shown = ballots(splat, views, num_parts)
+        told["odd"] = (shown >= TOLD).any(0) & (torch.arange(len(splat)) % 2 == 1)
+        return votes, shown * told["odd"]
+
+    def noted(splat, logits, known):
+        assert torch.equal(known, told["odd"])
+        told["logits"] = spread(splat, logits, known)
+        return told["logits"]
+
+    monkeypatch.setattr(semantic, "ballots", ballots_of_odd_ones)
+    monkeypatch.setattr(semantic, "spread", noted)
+    trainer = semantic_trainer(capture_dir, steps=12, semantic_start=8)
+    trainer.train()
+    learned, odd = trainer.pipeline.model.gauss_params["semantics"], told["odd"]
+    assert torch.equal(learned[~odd], told["logits"][~odd])
+    assert 0 < odd.sum() and not torch.equal(learned[odd], told["logits"][odd])
 
 
 def test_gaussians_of_the_surroundings_come_on_top_of_the_limit(opaque_capture_dir, semantic_trainer):

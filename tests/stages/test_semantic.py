@@ -51,15 +51,28 @@ def test_accumulation_loss_is_the_mean_difference():
 
 def test_votes_find_the_parts_of_visible_gaussians():
     forgotten = replace(SPLAT, part_logits=torch.zeros_like(SPLAT.part_logits))
-    logits = vote_logits(ballots(forgotten, VIEWS, 2))
+    logits = vote_logits(ballots(forgotten, VIEWS, 2)[0])
     seen = logits.amax(-1) > math.log(0.9)  # what views agree on
     assert seen.float().mean() > 0.3
     assert (logits.argmax(-1) == SPLAT.part_ids)[seen].float().mean() > 0.99
 
 
+def test_a_view_shows_little_of_what_lies_behind_others():
+    hidden = box(2, (0.1, 0.1, 0.05), (0.0, 0.0, -0.3))  # inside the first box
+    _, shown = ballots(Splat.cat([SPLAT, hidden]), VIEWS, 2)
+    assert shown.shape == (len(VIEWS), len(SPLAT) + len(hidden))
+    assert shown[:, len(SPLAT) :].max() < 0.05
+    assert (shown.amax(0) > 0.2)[: len(SPLAT)].float().mean() > 0.5 and shown.max() < 1.1
+
+
+def test_a_view_shows_nothing_where_it_has_no_labels():
+    unlabelled = [replace(view, labels=torch.full_like(view.labels, UNLABELLED)) for view in VIEWS[:2]]
+    assert (ballots(SPLAT, unlabelled, 2)[1] == 0).all()
+
+
 def test_unlabelled_pixels_have_no_vote():
     silent = [replace(view, labels=torch.full_like(view.labels, UNLABELLED)) for view in VIEWS]
-    logits = vote_logits(ballots(SPLAT, silent, 2))
+    logits = vote_logits(ballots(SPLAT, silent, 2)[0])
     assert torch.allclose(logits, logits[:1, :1].expand_as(logits))
 
 
@@ -70,7 +83,7 @@ def swapped(view):
 @pytest.mark.parametrize("wrong", [{3}, {1, 5, 6}])
 def test_views_that_contradict_the_others_are_not_trusted(wrong):
     views = [swapped(view) if i in wrong else view for i, view in enumerate(VIEWS[:9])]
-    kept = trusted(ballots(SPLAT, views, 2))
+    kept = trusted(ballots(SPLAT, views, 2)[0])
     assert {i for i, keep in enumerate(kept.tolist()) if not keep} == wrong
 
 
@@ -80,9 +93,9 @@ def test_right_labels_are_trusted_even_if_their_outlines_are_rough():
     for view in VIEWS:
         shift = torch.randint(-1, 2, (2,), generator=g).tolist()
         rough.append(replace(view, labels=view.labels.roll(shift, (0, 1))))
-    assert trusted(ballots(SPLAT, rough, 2)).all()
+    assert trusted(ballots(SPLAT, rough, 2)[0]).all()
 
 
 def test_of_two_views_none_is_called_wrong():
-    assert trusted(ballots(SPLAT, [VIEWS[4], swapped(VIEWS[5])], 2)).all()
-    assert trusted(ballots(SPLAT, [], 2)).shape == (0,)
+    assert trusted(ballots(SPLAT, [VIEWS[4], swapped(VIEWS[5])], 2)[0]).all()
+    assert trusted(ballots(SPLAT, [], 2)[0]).shape == (0,)

@@ -5,7 +5,7 @@ from part_scene import box, photograph
 
 from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
+from splatart_ns.stages.silhouette import rendered_silhouette, with_rendered_labels, with_silhouette
 
 OBJECT = box(1, (0.5, 0.4, 0.3), (0.0, 0.0, 0.0))
 FLOOR = box(0, (2.0, 2.0, 0.1), (0.0, 0.0, -0.5))
@@ -28,3 +28,21 @@ def test_surroundings_are_no_part_of_a_rendered_silhouette():
     differ = silhouette != (VIEW.labels > 0)
     assert differ.float().mean() < 0.03 < silhouette.float().mean()
     assert rendered_silhouette(opaque, FLOOR).alpha.max() < 10
+
+
+def test_a_view_without_labels_gets_those_that_the_splat_shows():
+    parts = Splat.cat([OBJECT, box(2, (0.3, 0.3, 0.2), (0.1, 0.0, 0.3))])
+    view = photograph(parts, count=6)[1]
+    made = with_rendered_labels(replace(view, labels=None), parts)
+    inside = (view.alpha > 0) & (view.labels > 0)
+    assert (made.labels == view.labels)[inside].float().mean() > 0.99
+    assert set(view.labels[inside].tolist()) == {1, 2}
+    assert (made.labels[view.alpha == 0] == 0).all()
+    assert with_rendered_labels(view, parts) is view
+
+
+def test_what_the_splat_misses_stays_unlabelled():
+    made = with_rendered_labels(replace(VIEW, labels=None), OBJECT.select(OBJECT.means[:, 0] < 0))
+    missed = (made.labels == UNLABELLED) & (VIEW.alpha > 0)
+    assert 0.1 < missed.sum() / (VIEW.alpha > 0).sum() < 0.9
+    assert not (made.labels == UNLABELLED)[VIEW.alpha == 0].any()
