@@ -21,6 +21,10 @@ ACROSS = 10.0
 drawer's side is near the wall that it slides along."""
 LEAST = 1e-3
 """Share of a label that is not told."""
+HELD = 1e-6
+"""Weight of the nearest label that is told: it decides where neighbours lead to none."""
+ITERATIONS = 200
+"""Of conjugate gradients, at most: as many Gaussians from what is told, nearly all labels are as they stay."""
 
 
 @torch.no_grad()
@@ -28,25 +32,28 @@ def spread(splat: Splat, logits: Tensor, told: Tensor) -> Tensor:
     """Part logits [N, P + 1] in which the Gaussians that are not `told` [N] bool have what their neighbours say.
 
     Each label's share is the weighted mean of its neighbours', all at once (harmonic functions on a graph, Zhu,
-    Ghahramani and Lafferty 2003). Those that are connected with nothing told get equal logits.
+    Ghahramani and Lafferty 2003). Those that are connected with nothing told have what the nearest told one has.
     """
     if told.all() or not told.any():
         return logits
-    weights = _weights(splat)
+    means, weights = splat.means.double().numpy(force=True), _weights(splat)
     known, unknown = (which.numpy(force=True).nonzero()[0] for which in (told, ~told))
-    shares = logits.softmax(-1).double().numpy(force=True)
+    shares = logits.softmax(-1).double().numpy(force=True)[known]
+    start = shares[cKDTree(means[known]).query(means[unknown])[1]]
     laplacian = (diags(np.asarray(weights.sum(1)).ravel()) - weights).tocsr()[unknown]
-    inner, edge = laplacian[:, unknown], -laplacian[:, known]
+    inner = laplacian[:, unknown]
+    missing = -laplacian[:, known] @ shares - inner @ start
     scale = diags(1 / inner.diagonal())
-    found = np.stack([cg(inner, edge @ column, M=scale)[0] for column in shares[known].T], axis=1)
+    inner = inner + HELD * diags(inner.diagonal())
+    found = start + np.stack([cg(inner, of_label, maxiter=ITERATIONS, M=scale)[0] for of_label in missing.T], axis=1)
     logits = logits.clone()
     logits[~told] = torch.from_numpy(found.clip(LEAST, 1)).log().to(logits)
     return logits
 
 
 def _weights(splat: Splat) -> csr_matrix:
-    """How much neighbouring Gaussians have to do with each other [N, N], symmetric: less the further apart they are,
-    and the more the surfaces that they are flat on turn from one to the other."""
+    """How much neighbouring Gaussians have to do with each other [N, N], symmetric: less the further they are apart and
+    the more the surface that they are flat on turns between them."""
     means = splat.means.double().numpy(force=True)
     R = matrix_from_quat(torch.nn.functional.normalize(splat.quats, dim=-1)).double()
     thin = splat.log_scales.argmin(-1)

@@ -46,12 +46,11 @@ def test_between_two_labels_each_gaussian_has_the_nearer_one():
     assert torch.allclose(of_columns.mean(1), torch.linspace(1, 0, 20), atol=0.04)
 
 
-def test_what_is_connected_with_nothing_told_gets_equal_logits():
-    far = plate(2, 5.0)
-    told = torch.arange(2 * len(WALL)) < len(WALL)
-    found = spread(Splat.cat([WALL, far]), torch.cat([WALL.part_logits, far.part_logits]), told)
-    assert torch.equal(found[:400], WALL.part_logits)
-    assert torch.allclose(found[400:], found[400:, :1].expand(-1, 3), atol=1e-4)
+def test_what_is_connected_with_nothing_told_has_the_nearest_label():
+    near, far = plate(2, 2.0), plate(1, 6.0)
+    both, told = Splat.cat([WALL, near, far]), torch.arange(3 * len(WALL)) < 2 * len(WALL)
+    found = spread(both, both.part_logits, told)
+    assert torch.equal(found.argmax(-1), both.part_ids.where(told, 2))
 
 
 def test_labels_stay_where_all_or_none_are_told():
