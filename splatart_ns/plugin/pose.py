@@ -6,7 +6,7 @@ import math
 import random
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -180,8 +180,13 @@ class PosePipeline(VanillaPipeline):
         self._reference, self._known, self._frozen = [0] * P, torch.ones(S, P, dtype=torch.bool), torch.zeros(S, P) > 0
         self._maybe_moved = torch.zeros(S, P) > 0
         self.model.start(splats, self._initial_poses(splats), self._frozen)
-        self._pairs = self._shuffled_pairs()
-        self._own = self._shuffled_views()
+        # Gaussians learn labels that somebody gave: by those that they showed themselves, images come out worse.
+        to_learn = [
+            [view if own else replace(view, labels=None) for view, own in zip(views, state.labelled, strict=True)]
+            for views, state in zip(self.views, states, strict=True)
+        ]
+        self._pairs = self._shuffled_pairs(to_learn)
+        self._own = self._shuffled_views(to_learn)
 
     def _bring_together(self, splats: list[Splat], capture: Capture) -> None:
         """Move splats and views of all states into the world of state 0."""
@@ -289,11 +294,11 @@ class PosePipeline(VanillaPipeline):
         motions = read_motions(self.config.init_file, list(capture.parts.values()), len(capture.states))
         return torch.from_numpy(capture.normalization.motion_to_normal(motions.numpy()))
 
-    def _shuffled_pairs(self) -> Iterator[tuple[int, int, View]]:
+    def _shuffled_pairs(self, of_states: list[list[View]]) -> Iterator[tuple[int, int, View]]:
         """(source, target, target view): all pairs of states in turn, both ways round, every view of a state before
         any again."""
         rng = random.Random(self.config.seed)
-        S = len(self.views)
+        S = len(of_states)
         queues: list[list[View]] = [[] for _ in range(S)]
         while True:
             pairs = [(a, b) for a in range(S) for b in range(S) if a < b]
@@ -301,14 +306,14 @@ class PosePipeline(VanillaPipeline):
             for a, b in pairs:
                 for source, target in ((a, b), (b, a)):
                     if not queues[target]:
-                        queues[target] = rng.sample(self.views[target], len(self.views[target]))
+                        queues[target] = rng.sample(of_states[target], len(of_states[target]))
                     yield source, target, queues[target].pop()
 
-    def _shuffled_views(self) -> Iterator[tuple[int, View, float]]:
+    def _shuffled_views(self, of_states: list[list[View]]) -> Iterator[tuple[int, View, float]]:
         """(state, view, share): the piece around the object of every view of every state before any again, and its
         share of the image."""
         rng = random.Random(self.config.seed)
-        pieces = [(s, v, v.cropped(v.object_window())) for s, views in enumerate(self.views) for v in views]
+        pieces = [(s, v, v.cropped(v.object_window())) for s, views in enumerate(of_states) for v in views]
         everything = [(s, piece, piece.alpha.numel() / v.alpha.numel()) for s, v, piece in pieces]
         while True:
             yield from rng.sample(everything, len(everything))

@@ -29,8 +29,10 @@ class LabelledState:
 
     splat: Splat
     views: list[View]
-    """The training views, with the cameras that the run ended with and without labels that contradict the others'. Each
-    says where the object ends: parts are rendered without what surrounds them."""
+    """The training views, with the cameras that the run ended with. Each says where the object ends: parts are rendered
+    without what surrounds them. Those without labels, or whose labels contradict the others', have the splat's."""
+    labelled: list[bool]
+    """Which views have labels of their own."""
     cameras_refined: bool
 
 
@@ -56,8 +58,9 @@ def read_state(
         )
     views = [view.to(device) for view in learned_views(capture, state, checkpoint, downscale)]
     views = [with_silhouette(view) or rendered_silhouette(view, splat) for view in views]
+    labelled = [view.labels is not None for view in views]
     views = [with_rendered_labels(view, splat) for view in views]
-    return LabelledState(splat, views, bool(checkpoint["_model.cameras_refined"]))
+    return LabelledState(splat, views, labelled, bool(checkpoint["_model.cameras_refined"]))
 
 
 def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:

@@ -92,6 +92,19 @@ def test_gaussians_that_no_view_shows_are_left_out(pose_trainer, monkeypatch):
     assert [len(model.state_splat(state)) for state in (0, 1)] == [1, 1]
 
 
+def test_poses_look_at_the_labels_that_the_splats_show_and_gaussians_learn_only_given_ones(pose_trainer, capture_dir):
+    pipeline = pose_trainer(init="centroids").pipeline
+    names = [
+        {frame.name for frame in state.split("train") if frame.labels is not None}
+        for state in require_valid(capture_dir).states
+    ]
+    assert all(0 < len(of_state) < 10 for of_state in names)
+    assert all(view.labels is not None for views in pipeline.views for view in views)
+    learned = [next(pipeline._own)[:2] for _ in range(20)]
+    aims = [next(pipeline._pairs)[1:] for _ in range(20)]
+    assert all((view.labels is not None) == (view.name in names[s]) for s, view in (*learned, *aims))
+
+
 def test_a_part_in_doubt_is_sought_along_the_ways_of_sure_slides(pose_trainer, monkeypatch):
     slide, over, better = (torch.eye(4).double() for _ in range(3))
     slide[1, 3], over[2, 3], better[1, 3] = 0.3, 0.5, 0.2
