@@ -315,7 +315,7 @@ def test_merged_gaussians_learn_from_the_pieces_that_show_the_object(pose_traine
         view.alpha = view.alpha.clone()
         view.alpha[24:] = view.alpha[:, 24:] = 0
         view.alpha[0, 0] = 255
-    own = pipeline._shuffled_views()
+    own = pipeline._shuffled_views(pipeline.views)
     for state, piece, share in (next(own) for _ in views):
         whole = next(view for view in pipeline.views[state] if view.name == piece.name)
         assert piece.alpha.sum() == whole.alpha.sum()
