@@ -115,7 +115,7 @@ def sweep_values(joint: Joint) -> Tensor:
 
 
 def _looks(views: Sequence[View], part: int, count: int, pixels: int) -> list[PartView]:
-    chosen = [view for view in best_views(views, part, count) if view.labels is not None]
+    chosen = best_views(views, part, count)
     if not chosen:
         return []
     area = sum(float((view.labels == part).sum()) for view in chosen) / len(chosen)

@@ -49,8 +49,6 @@ def border_against_others(views: Sequence[View], part: int) -> float:
     """The share of a part's border, in labelled views, that lies against other parts; 0 where none shows it."""
     against = torch.zeros(2)
     for view in best_views(views, part, MAX_VIEWS):
-        if view.labels is None:
-            continue
         for labels in (view.labels, view.labels.T):
             for inside, beside in ((labels[1:], labels[:-1]), (labels[:-1], labels[1:])):
                 beside = beside[(inside == part) & (beside != part) & (beside != UNLABELLED)]

@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.view import View, Window, box
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.geometry.similarity import inverse_similarity, view_of_moved
@@ -107,29 +106,20 @@ class PartView:
 def part_view(
     view: View, part: int, factor: int = 1, device: torch.device | None = None, near: bool = False
 ) -> PartView | None:
-    """What `view` says of a part; None if it says nothing.
+    """What a labelled view says of a part; None if it does not show it.
 
-    An unlabelled view tells only where the background is, and only if it has an alpha. Where the part is rendered
-    `near` to where the view shows it, the piece need not be wide.
+    Where the part is rendered `near` to where the view shows it, the piece need not be wide.
     """
-    if view.labels is not None:
-        own, background = view.labels == part, view.labels == 0
-        unlabelled = view.labels == UNLABELLED
-    elif view.alpha is not None:
-        own = torch.zeros_like(view.alpha, dtype=torch.bool)
-        background = view.alpha == 0
-        unlabelled = ~background
-    else:
-        return None
+    own = view.labels == part
     alpha = own.float() if view.alpha is None else view.alpha.float() / 255
-    weight = ((own | background) & ~unlabelled).float()
+    weight = (own | (view.labels == 0)).float()
     if view.mask is not None:
         weight = weight * view.mask
-    if not weight.any() or view.labels is not None and not (weight * own).any():
+    if not (weight * own).any():
         return None
     rgba = torch.cat([view.rgb.float() / 255 * alpha[..., None], alpha[..., None]], -1)
 
-    left, top, right, bottom = _window(own if own.any() else weight > 0, factor, near)
+    left, top, right, bottom = _window(own, factor, near)
     rgba, weight = rgba[top:bottom, left:right], weight[top:bottom, left:right]
     K = view.K.clone()
     K[0, 2] -= left
@@ -161,21 +151,16 @@ def _window(shown: Tensor, factor: int, near: bool) -> Window:
 
 
 def best_views(views: Sequence[View], part: int, count: int) -> list[View]:
-    """Up to `count` views that show a part well, from directions far apart (farthest point sampling).
-
-    Only where labelled views are fewer, unlabelled ones with an alpha join them. Empty if no label shows the part.
-    """
+    """Up to `count` labelled views that show a part well, from directions far apart (farthest point sampling)."""
     area = torch.tensor([0 if v.labels is None else int((v.labels == part).sum()) for v in views])
     if not (area > 0).any():
         return []
-    silhouette = torch.tensor([v.labels is None and v.alpha is not None for v in views])
     centres = torch.stack([inverse(v.viewmat)[:3, 3] for v in views])
     chosen = [int(area.argmax())]
-    for usable in (area > 0.25 * area.max(), silhouette):
-        pool = [int(i) for i in usable.nonzero()[:, 0] if int(i) not in chosen]
-        while len(chosen) < count and pool:
-            distance = torch.cdist(centres[pool], centres[chosen]).amin(1)
-            chosen.append(pool.pop(int(distance.argmax())))
+    pool = [int(i) for i in (area > 0.25 * area.max()).nonzero()[:, 0] if int(i) not in chosen]
+    while len(chosen) < count and pool:
+        distance = torch.cdist(centres[pool], centres[chosen]).amin(1)
+        chosen.append(pool.pop(int(distance.argmax())))
     return [views[i] for i in chosen]
 
 
@@ -266,7 +251,7 @@ def part_pair(
     pieces = []
     for state_views in views:
         chosen = best_views(state_views, part, num_views)
-        areas = [float((v.labels == part).sum()) for v in chosen if v.labels is not None]
+        areas = [float((v.labels == part).sum()) for v in chosen]
         factor = max(1, int((sum(areas) / max(1, len(areas)) / pixels) ** 0.5))
         pieces.append(tuple(p for v in chosen if (p := part_view(v, part, factor, device, near)) is not None))
     if not pieces[0] and not pieces[1]:
