@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.view import View
@@ -26,30 +27,30 @@ def with_silhouette(view: View) -> View | None:
     return replace(view, alpha=alpha, mask=counts if view.mask is None else view.mask & counts)
 
 
-@torch.no_grad()
 def rendered_silhouette(view: View, splat: Splat) -> View:
     """The view with the alpha that a labelled splat of object and surroundings shows: its share of parts' Gaussians."""
-    camera = view.viewmat[None].to(splat.means), view.K[None].to(splat.means)
-    rendering = render(
-        splat, *camera, view.width, view.height, features=splat.part_probabilities, with_depth=False, sh_degree=0
-    )
-    share = 1 - part_image(rendering)[0, ..., 0]
-    return replace(view, alpha=(255 * share.clamp(0, 1)).round().to(torch.uint8).to(view.rgb.device))
+    share = 1 - _shares(view, splat)[..., 0]
+    return replace(view, alpha=(255 * share.clamp(0, 1)).round().to(torch.uint8))
 
 
 SHOWN = 0.1
 """Where a splat shows less than this of the object, it does not know what is there."""
 
 
-@torch.no_grad()
 def with_rendered_labels(view: View, splat: Splat) -> View:
     """The view, which has an alpha, with the labels that a labelled splat shows where it has none of its own."""
     if view.labels is not None:
         return view
+    of_parts = _shares(view, splat)[..., 1:]
+    labels = torch.where(of_parts.sum(-1) >= SHOWN, of_parts.argmax(-1) + 1, UNLABELLED)
+    return replace(view, labels=labels.where(view.alpha > 0, 0).to(torch.uint8))
+
+
+@torch.no_grad()
+def _shares(view: View, splat: Splat) -> Tensor:
+    """How much of each pixel is background and each part by a labelled splat [H, W, P + 1], on the view's device."""
     camera = view.viewmat[None].to(splat.means), view.K[None].to(splat.means)
     rendering = render(
         splat, *camera, view.width, view.height, features=splat.part_probabilities, with_depth=False, sh_degree=0
     )
-    of_parts = part_image(rendering)[0, ..., 1:].to(view.rgb.device)
-    labels = torch.where(of_parts.sum(-1) >= SHOWN, of_parts.argmax(-1) + 1, UNLABELLED)
-    return replace(view, labels=labels.where(view.alpha > 0, 0).to(torch.uint8))
+    return part_image(rendering)[0].to(view.rgb.device)
