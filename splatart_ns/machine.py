@@ -31,15 +31,19 @@ def memory_mb() -> int:
     return (min(memory, int(limit)) if limit.isdigit() else memory) // 2**20
 
 
-def num_gpus() -> int:
-    """CUDA devices that this process may use, found without loading CUDA."""
+def gpu_memory_mb() -> dict[str, int]:
+    """CUDA devices that this process may use, as CUDA_VISIBLE_DEVICES names them, each with its memory in MiB, that of
+    the smallest for all; 0 where it is not known, as for a part of a GPU (MIG). Found without loading CUDA."""
+    sizes: list[int] = []
+    if shutil.which("nvidia-smi") is not None:
+        query = ["nvidia-smi", "--query-gpu=memory.total,mig.mode.current", "--format=csv,noheader,nounits"]
+        told = subprocess.run(query, capture_output=True, text=True, check=False)
+        for line in told.stdout.splitlines() if told.returncode == 0 else ():
+            size, _, mig = line.partition(", ")
+            sizes.append(int(size) if size.isdigit() and mig != "Enabled" else 0)
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if visible is not None:
-        return len([name for name in visible.split(",") if name.strip() not in ("", "-1")])
-    if shutil.which("nvidia-smi") is None:
-        return 0
-    listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
-    return sum(line.startswith("GPU ") for line in listed.stdout.splitlines())
+    names = [str(i) for i in range(len(sizes))] if visible is None else [name.strip() for name in visible.split(",")]
+    return {name: min(sizes, default=0) for name in names if name not in ("", "-1")}
 
 
 def process_lives(pid: int) -> bool:

@@ -59,7 +59,7 @@ def run(tmp_path):
     def run(entries, out=None, recipe=None, engine=None, **options) -> Recorder:
         told = Recorder()
         recipe = StubRecipe(str(tmp_path / "log")) if recipe is None else recipe
-        run_batch(entries, str(out or tmp_path / "out"), recipe, engine or ProcessPool(2, 4000, 0), told, **options)
+        run_batch(entries, str(out or tmp_path / "out"), recipe, engine or ProcessPool(2, 4000, {}), told, **options)
         return told
 
     return run

@@ -128,7 +128,7 @@ def test_stages_run_with_one_thread_each(run, captures, tmp_path):
 
 
 def test_stages_for_a_gpu_run_where_there_is_one(run, captures, tmp_path):
-    told = run(captures("a", "b"), recipe=StubRecipe(gpu=True), engine=ProcessPool(2, 4000, 1))
+    told = run(captures("a", "b"), recipe=StubRecipe(gpu=True), engine=ProcessPool(2, 4000, {"0": 16000}))
     assert told.status() == {"a": "done", "b": "done"}
     for marker in (tmp_path / "out").glob("*/stages/copy*.json"):
         assert json.loads(marker.read_text())["outcome"]["gpu"] == "0"
@@ -150,7 +150,7 @@ from splatart_ns.batch.pool import ProcessPool
 captures, out, log, *names = sys.argv[1:]
 entries = [Entry(name, f"{captures}/{name}") for name in names]
 if __name__ == "__main__":
-    run_batch(entries, out, StubRecipe(log, seconds=0.03), ProcessPool(2, 4000, 0), Mock())
+    run_batch(entries, out, StubRecipe(log, seconds=0.03), ProcessPool(2, 4000, {}), Mock())
 """
 
 
@@ -223,7 +223,7 @@ def test_two_batches_at_once_share_the_work(captures, recorder, tmp_path, log):
     recipe = StubRecipe(str(tmp_path / "log"), seconds=0.05)  # longer in all than a process takes to start
     threads = [
         threading.Thread(
-            target=run_batch, args=(entries, str(tmp_path / "out"), recipe, ProcessPool(1, 4000, 0), recorded)
+            target=run_batch, args=(entries, str(tmp_path / "out"), recipe, ProcessPool(1, 4000, {}), recorded)
         )
         for recorded in told
     ]
@@ -242,7 +242,7 @@ def test_two_batches_with_other_settings_leave_whole_objects(captures, recorder,
     threads = []
     for seed in (0, 1):
         mine = [replace(entry, settings={"seed": seed, "root": str(seed)}) for entry in entries]
-        arguments = (mine, str(tmp_path / "out"), recipe, ProcessPool(1, 4000, 0), recorder())
+        arguments = (mine, str(tmp_path / "out"), recipe, ProcessPool(1, 4000, {}), recorder())
         threads.append(threading.Thread(target=run_batch, args=arguments))
     for thread in threads:
         thread.start()

@@ -32,7 +32,7 @@ def results(pool, count):
 
 
 def test_results_come_with_their_tickets(pool):
-    pool = pool(2, 1000, 0)
+    pool = pool(2, 1000, {})
     pool.start("a", Needs(), pow, 2, 5)
     pool.start("b", Needs(), pow, 3, 2)
     assert not pool.fits(Needs())
@@ -41,7 +41,7 @@ def test_results_come_with_their_tickets(pool):
 
 
 def test_a_task_waits_until_its_memory_is_free_and_starts_at_last(pool):
-    pool = pool(4, 1000, 0)
+    pool = pool(4, 1000, {})
     pool.start("a", Needs(memory_mb=700), abs, 1)
     assert pool.fits(Needs(memory_mb=300)) and not pool.fits(Needs(memory_mb=301))
     results(pool, 1)
@@ -50,13 +50,13 @@ def test_a_task_waits_until_its_memory_is_free_and_starts_at_last(pool):
 
 def test_a_process_leaves_no_file_behind_even_if_it_is_killed(pool, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    pool = pool(1, 1000, 0)
+    pool = pool(1, 1000, {})
     pool.start("a", Needs(), os.listdir, tmp_path)
     assert results(pool, 1) == {"a": []}
 
 
 def test_a_process_that_dies_takes_its_own_task_alone(pool):
-    pool = pool(2, 1000, 0)
+    pool = pool(2, 1000, {})
     pool.start("ends", Needs(), os._exit, 7)
     pool.start("sleeps", Needs(), time.sleep, 0.2)
     ended = results(pool, 2)
@@ -66,23 +66,44 @@ def test_a_process_that_dies_takes_its_own_task_alone(pool):
     assert results(pool, 1) == {"next": 1}
 
 
-def test_each_gpu_belongs_to_one_process(pool):
-    pool = pool(3, 10000, 2)
-    on_gpu = Needs(gpu=True)
-    for ticket in ("a", "b"):
+def where(ended):
+    return sorted(ended.values())
+
+
+def test_processes_share_the_gpus_evenly_up_to_four_each(pool):
+    pool = pool(10, 100000, {"0": 16000, "1": 16000})
+    on_gpu = Needs(memory_mb=1000, gpu=True)
+    for ticket in range(2):
+        pool.start(ticket, on_gpu, os.getenv, "CUDA_VISIBLE_DEVICES")
+    assert where(results(pool, 2)) == ["0", "1"]
+    for ticket in range(8):
+        assert pool.fits(on_gpu)
         pool.start(ticket, on_gpu, os.getenv, "CUDA_VISIBLE_DEVICES")
     assert not pool.fits(on_gpu) and pool.fits(Needs())
     pool.start("cpu", Needs(), os.getenv, "CUDA_VISIBLE_DEVICES")
-    ended = results(pool, 3)
-    assert {ended["a"], ended["b"]} == {"0", "1"} and ended["cpu"] == ""
+    assert where(results(pool, 9)) == [""] + 4 * ["0"] + 4 * ["1"]
 
 
-def test_the_gpus_that_the_user_grants(pool, monkeypatch):
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
-    pool = pool(1, 10000, None)
+def test_a_gpu_has_the_processes_that_its_memory_has_room_for(pool):
+    pool = pool(8, 100000, {"0": 5000})
+    pool.start("a", Needs(memory_mb=3000, gpu=True), abs, 1)
+    assert pool.fits(Needs(memory_mb=1500, gpu=True)) and not pool.fits(Needs(memory_mb=1501, gpu=True))
+    results(pool, 1)
+    assert pool.fits(Needs(memory_mb=9000, gpu=True))  # more than it has: alone
+
+
+def test_a_gpu_of_unknown_memory_has_one_process(pool):
+    pool = pool(8, 100000, {"MIG-1": 0})
+    pool.start("a", Needs(memory_mb=1000, gpu=True), os.getenv, "CUDA_VISIBLE_DEVICES")
+    assert not pool.fits(Needs(gpu=True))
+    assert results(pool, 1) == {"a": "MIG-1"}
+
+
+def test_without_more_cores_than_gpu_processes_these_do_the_rest(pool):
+    pool = pool(1, 10000, {"3": 8000})
     pool.start("a", Needs(gpu=True), os.getenv, "CUDA_VISIBLE_DEVICES")
     assert results(pool, 1) == {"a": "3"}
-    assert pool.fits(Needs())  # its one process takes what needs no GPU, too
+    assert pool.fits(Needs())
 
 
 def test_pools_in_two_threads_start_processes_with_the_right_environment(pool, monkeypatch):
@@ -94,7 +115,7 @@ def test_pools_in_two_threads_start_processes_with_the_right_environment(pool, m
         start(process)
 
     monkeypatch.setattr(SpawnProcess, "start", slow_start)
-    pools = [pool(1, 1000, 0), pool(1, 1000, 0)]
+    pools = [pool(1, 1000, {}), pool(1, 1000, {})]
 
     def run(number):
         time.sleep(0.1 * number)

@@ -32,7 +32,7 @@ def make(recorder):
     def make(bundles, out, options=OPTIONS):
         told = recorder()
         entries = Shards(str(bundles), find_bundles(str(bundles)), options)
-        run_batch(entries, str(out), Sharding(options, "torch"), ProcessPool(1, 8000, 0), told)
+        run_batch(entries, str(out), Sharding(options, "torch"), ProcessPool(1, 8000, {}), told)
         return told
 
     return make
