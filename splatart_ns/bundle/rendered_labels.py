@@ -13,9 +13,9 @@ from torch import Tensor
 
 from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.posing import moved_splat, normalized, observed_motions, part_features
-from splatart_ns.capture.annotations import write_mask_classes
 from splatart_ns.capture.capture import UNLABELLED, Camera, Capture, Frame, Normalization
 from splatart_ns.capture.images import read_image, read_sized, undistorted_points, write_png
+from splatart_ns.capture.mask_export import write_mask_classes
 from splatart_ns.errors import InputError
 from splatart_ns.files import new_folder, replacing
 from splatart_ns.geometry.camera import viewmat_from_opengl

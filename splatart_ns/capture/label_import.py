@@ -16,15 +16,10 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from splatart_ns.capture.annotations import (
-    BACKGROUND_NAMES,
-    IMAGE_SUFFIXES,
-    UNLABELLED_NAMES,
-    AnnotatedImage,
-    Annotations,
-    read_annotations,
-)
+from splatart_ns.capture.annotated_image import IMAGE_SUFFIXES, AnnotatedImage
+from splatart_ns.capture.annotations import Annotations, read_annotations
 from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame, State
+from splatart_ns.capture.class_list import BACKGROUND_NAMES, UNLABELLED_NAMES
 from splatart_ns.capture.formats import SPLITS, TRANSFORMS, load_capture, load_states
 from splatart_ns.capture.images import MAX_LABEL, as_stored, orientation, write_png
 from splatart_ns.capture.values import DISTORTION, is_inside, read_json, relative_path, show

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from splatart_ns.capture.annotations import write_mask_classes
 from splatart_ns.capture.capture import Capture, CaptureError, Frame, State
 from splatart_ns.capture.images import MAX_LABEL, read_image, read_sized, write_png
+from splatart_ns.capture.mask_export import write_mask_classes
 from splatart_ns.capture.values import parse_number, read_json, show
 from splatart_ns.errors import InputError
 from splatart_ns.files import new_folder

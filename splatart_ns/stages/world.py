@@ -160,5 +160,7 @@ def world_sentence(record: dict[str, Any], first: str) -> str:
         f"+- {record['turn_deviation_degrees']:.2f} deg"
     )
     if record["residual_ratio"] > SUSPECT:
-        return f"{sentence}; its images fit badly, check the result, or name another part by --root."
+        kept = record["scale_deviation"] == 0
+        mend = "let its scale be found (--worlds similar), or name" if kept else "check the result, or name"
+        return f"{sentence}; its images fit badly, {mend} another part by --root."
     return f"{sentence}."

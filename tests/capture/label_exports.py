@@ -11,6 +11,7 @@ import numpy as np
 from pycocotools import mask as coco
 
 from splatart_ns.capture.capture import Capture, Frame, State
+from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.images import read_labels
 
 Naming = Callable[[State, Frame], str]
@@ -102,3 +103,54 @@ def write_masks(capture: Capture, folder: Path, name: Naming = roboflow_name) ->
         (folder / "train" / f"{stem}.jpg").write_bytes(frame.image.read_bytes())
         assert cv2.imwrite(str(folder / "train" / f"{stem}_mask.png"), labels)
     return folder
+
+
+def without_labels(path):
+    """The capture without any label."""
+    for file in path.rglob("*.png"):
+        if "labels" in file.parent.name or "semantics" in file.parent.name:
+            file.unlink()
+    for file in path.rglob("transforms.json"):
+        meta = json.loads(file.read_text())
+        meta.pop("semantic_classes", None)
+        for entry in meta["frames"]:
+            entry.pop("semantics_path")
+        file.write_text(json.dumps(meta))
+    return path
+
+
+def ragged(capture):
+    """Labels with holes, single pixels and unlabelled ones, another in every frame."""
+    rng = np.random.default_rng(0)
+    for state in capture.states:
+        for frame in state.frames:
+            labels = read_labels(frame.labels)
+            labels[rng.random(labels.shape) < 0.1] = 1
+            labels[rng.random(labels.shape) < 0.1] = 2
+            labels[rng.random(labels.shape) < 0.1] = 255
+            cv2.imwrite(str(frame.labels), labels)
+    return capture
+
+
+def all_labels(path):
+    capture = load_capture(path)
+    return {
+        (state, frame.image.parts[-2:], frame.split): read_labels(frame.labels).tolist()
+        for state, frames in enumerate(s.frames for s in capture.states)
+        for frame in frames
+        if frame.labels is not None
+    }
+
+
+EXPORTS = {
+    "COCO polygons": lambda c, out: write_coco(c, out / "_annotations.coco.json", "polygons"),
+    "COCO runs": lambda c, out: write_coco(c, out / "instances.json", "runs"),
+    "COCO compressed runs": lambda c, out: write_coco(c, out / "a/_annotations.coco.json", "compressed", roboflow_name),
+    "COCO folder": lambda c, out: write_coco(c, out / "train/_annotations.coco.json", "runs").parents[1],
+    "COCO of Label Studio": lambda c, out: write_coco(c, out / "result.json", "polygons", label_studio_name),
+    "YOLO": write_yolo,
+    "YOLO of Roboflow": lambda c, out: write_yolo(c, out, roboflow_name),
+    "YOLO of Label Studio": lambda c, out: write_yolo(c, out, label_studio_name),
+    "masks": lambda c, out: write_masks(c, out, flat_name),
+    "masks of Roboflow": write_masks,
+}

@@ -10,7 +10,15 @@ from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import world
 from splatart_ns.stages.visibility import visibility
-from splatart_ns.stages.world import anchors, fit_world, fit_worlds, moved_splat, moved_views
+from splatart_ns.stages.world import (
+    anchors,
+    fit_world,
+    fit_worlds,
+    moved_splat,
+    moved_views,
+    world_record,
+    world_sentence,
+)
 
 TURN = motion((10, 0, 40), (0.3, -0.2, 0.1))
 
@@ -43,6 +51,15 @@ def test_a_resting_part_brings_worlds_together(scale, with_scale):
     assert float(found.covariance[6, 6].sqrt()) < 5e-3 and (float(found.covariance[6, 6]) > 0) == with_scale
     corners = transform_points(T, torch.tensor([[0.45, 0.3, -0.3], [-0.45, -0.3, -0.15]]).double())
     assert torch.allclose(transform_points(found.T, corners), transform_points(there, corners), atol=3e-3)
+
+
+@pytest.mark.parametrize(("with_scale", "words"), [(False, "let its scale be found (--worlds similar)"), (True, None)])
+def test_a_world_of_another_scale_is_to_be_brought_together_with_its_scale(with_scale, words):
+    splats, views, _ = apart(2.5)
+    seen = [visibility(s, v) for s, v in zip(splats, views, strict=True)]
+    part, (found,) = fit_worlds(splats, views, seen, [1, 2], with_scale)
+    sentence = world_sentence(world_record("state_01", f"part {part}", found.T, found), "state_00")
+    assert words in sentence if words else "fit badly" not in sentence
 
 
 def test_haze_at_one_edge_makes_no_world_larger(monkeypatch):

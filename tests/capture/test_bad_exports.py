@@ -1,0 +1,97 @@
+"""Exports that cannot be imported."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from label_exports import flat_name, write_coco, write_masks, write_yolo
+
+from splatart_ns.capture.formats import load_capture
+from splatart_ns.capture.label_import import import_capture
+from splatart_ns.errors import InputError
+
+
+def change_coco(change):
+    def make(capture, folder):
+        file = write_coco(capture, folder / "labels.json", "runs")
+        content = json.loads(file.read_text())
+        change(content)
+        file.write_text(json.dumps(content))
+        return file
+
+    return make
+
+
+def change_text(pattern, text):
+    def make(capture, folder):
+        (file, *_) = write_yolo(capture, folder).glob(pattern)
+        file.write_text(text)
+        return folder
+
+    return make
+
+
+def zipped(capture, folder):
+    write_coco(capture, folder / "labels.json", "runs")
+    return Path(shutil.make_archive(folder, "zip", folder)).replace(folder / "labels.zip")
+
+
+def one_text(capture, folder):
+    return min(write_yolo(capture, folder).glob("train/labels/*.txt"))
+
+
+def segmentation_mask(capture, folder):
+    """As CVAT writes it."""
+    write_masks(capture, folder, flat_name)
+    (folder / "train/_classes.csv").unlink()
+    (folder / "train").rename(folder / "SegmentationClass")
+    (folder / "labelmap.txt").write_text("# label:color_rgb:parts:actions\nbackground:0,0,0::\nbase:250,50,83::\n")
+    (folder / "default.txt").write_text("0000\n0001\n0002\n0003\n0004\n")
+    return folder
+
+
+def segmentation(value):
+    return change_coco(lambda e: e["annotations"][0].update(segmentation=value))
+
+
+BAD_EXPORTS = {
+    "resized": (change_coco(lambda e: e["images"][0].update(width=640)), "640x16 pixels; export it at the size"),
+    "no name fits": (change_coco(lambda e: [i.update(file_name=f"a{i['id']}") for i in e["images"]]), "no frame"),
+    "ambiguous": (change_coco(lambda e: e["images"][0].update(file_name="0000.png")), "'0000.png' may be state_00/"),
+    "augmented": (change_coco(lambda e: e["images"][1].update(file_name="state_00_0000_png.rf.x.jpg")), "both label"),
+    "box": (segmentation([]), "not boxes"),
+    "two corners": (segmentation([[1, 2, 3, 4]]), "three corners"),
+    "corner of text": (segmentation([[1, 2, 3, 4, "x", 5]]), "a coordinate of a segmentation"),
+    "runs of another size": (segmentation({"size": [4, 4], "counts": [16]}), "is {'counts': [16]"),
+    "runs too long": (segmentation({"size": [16, 16], "counts": [10**12]}), "do not fill"),
+    "negative runs": (segmentation({"size": [16, 16], "counts": [300, -44]}), "do not fill"),
+    "damaged runs": (segmentation({"size": [16, 16], "counts": "\u00e9"}), "damaged"),
+    "runs cut off": (segmentation({"size": [16, 16], "counts": "o"}), "cut off"),
+    "runs of endless numbers": (segmentation({"size": [16, 16], "counts": "o" * 10**5}), "damaged"),
+    "unknown category": (change_coco(lambda e: e["annotations"][0].update(category_id=9)), "category_id 9"),
+    "unknown image": (change_coco(lambda e: e["annotations"][0].update(image_id=99)), "image_id 99"),
+    "no annotations": (change_coco(lambda e: e.update(annotations=[])), "labels no image"),
+    "annotations of text": (change_coco(lambda e: e.update(annotations=["x"])), "annotations[0] is 'x'"),
+    "YOLO boxes": (change_text("train/labels/*0003.txt", "0 0.5 0.5 0.1 0.1"), "a box is no polygon"),
+    "YOLO pixels": (change_text("train/labels/*0003.txt", "0 5 5 9 9 5 9"), "divide them"),
+    "YOLO words": (change_text("train/labels/*0003.txt", "door 0.5 0.5 0.1 0.1"), "line 1 is 'door"),
+    "YOLO class": (change_text("train/labels/*0003.txt", "7 0.1 0.1 0.2 0.1 0.2 0.2"), "class 7, which none of"),
+    "YOLO without NaN": (change_text("train/labels/*0003.txt", "0 nan 0.1 0.2 0.1 0.2 0.2"), "nan"),
+    "YAML with code": (change_text("data.yaml", "names: !!python/object/apply:os.getcwd []"), "not YAML"),
+    "YAML without names": (change_text("data.yaml", "names: 3"), "names is 3"),
+    "one text": (one_text, "give the folder that holds data.yaml or classes.txt"),
+    "zip": (zipped, "it is a zip; unpack it first"),
+    "masks of colours": (segmentation_mask, "export the labels as COCO 1.0"),
+    "nothing": (lambda c, folder: folder, "there are no labels here"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_EXPORTS)
+def test_what_cannot_be_imported_is_named_and_nothing_written(capture_folder, tmp_path, name):
+    make, words = BAD_EXPORTS[name]
+    export = make(load_capture(capture_folder), tmp_path / "export")
+    with pytest.raises(InputError) as error:
+        import_capture([capture_folder], tmp_path / "new", export)
+    assert words in str(error.value) and str(tmp_path / "export") in str(error.value)
+    assert {f.name for f in tmp_path.iterdir()} <= {"capture", "export"}
