@@ -68,6 +68,7 @@ def main(options: Options) -> None:
     kept = sum(point.key in records for point in plan)
     if kept:
         print(f"{kept} of {len(plan)} fits are kept from an earlier run; remove {results} to fit again", flush=True)
+    warm = False
     for number, point in enumerate(plan):
         if point.key in records:
             continue
@@ -75,6 +76,9 @@ def main(options: Options) -> None:
         if options.quick and expected_seconds(point, plan, records) > left:
             continue  # a shorter one may fit in
         print(f"{number + 1} of {len(plan)}: {point.key}", flush=True)
+        if not warm:  # the first fit of a fresh clone compiles the kernels, which counts for no setting
+            run(point, folder)
+            warm = True
         records[point.key] = record = run(point, folder)
         with results.open("a") as file:
             file.write(json.dumps(record) + "\n")
