@@ -195,7 +195,8 @@ def _serve(pipe: Connection, words: str) -> None:
             return
         os.ftruncate(log, 0)  # the last words are those of the task
         result = function(*arguments)
-        if torch := sys.modules.get("torch"):  # the next task on this GPU may be another process's
+        torch = sys.modules.get("torch")
+        if torch and torch.cuda.is_initialized():  # the next task on this GPU may be another process's
             gc.collect()
             torch.cuda.empty_cache()
         pipe.send(result)
