@@ -84,6 +84,16 @@ def test_processes_share_the_gpus_evenly_up_to_four_each(pool):
     assert where(results(pool, 9)) == [""] + 4 * ["0"] + 4 * ["1"]
 
 
+def test_a_task_goes_to_the_gpu_that_has_least_to_do(pool):
+    pool = pool(8, 100000, {"0": 16000, "1": 16000})
+    on_gpu = Needs(memory_mb=1000, gpu=True)
+    for ticket, seconds in enumerate((0.0, 60.0, 60.0, 0.0, 60.0)):  # on the one and the other by turns
+        pool.start(ticket, on_gpu, time.sleep, seconds)
+    assert set(results(pool, 2)) == {0, 3}
+    pool.start("next", on_gpu, os.getenv, "CUDA_VISIBLE_DEVICES")
+    assert results(pool, 1) == {"next": "1"}
+
+
 def test_a_gpu_has_the_processes_that_its_memory_has_room_for(pool):
     pool = pool(8, 100000, {"0": 5000})
     pool.start("a", Needs(memory_mb=3000, gpu=True), abs, 1)
