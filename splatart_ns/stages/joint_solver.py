@@ -44,11 +44,11 @@ def best_joints(kind: str, T: Tensor, whiten: Tensor, unseen: Tensor, points: li
     levers = torch.stack([x.square().sum(-1).mean().sqrt() for x in points]).clamp_min(1e-9)
     joints, iterations, converged = _descended(kind, _closed_form(kind, T), T, whiten, levers)
     if unseen.any():
-        back = se3_exp(-(unseen @ se3_log(inverse(model_motions(kind, joints)) @ T)[..., None])[..., 0])
+        back = se3_exp(-(unseen @ _left_over(kind, joints, T)[..., None])[..., 0])
         T, whiten = T @ back, whiten @ adjoint(back)
         joints, more, converged = _descended(kind, joints, T, whiten, levers)
         iterations = iterations + more
-    cost = _residuals(kind, joints, T, whiten).square().sum(-1)
+    cost = _whitened(whiten, _left_over(kind, joints, T)).square().sum(-1)
     return _results(kind, joints, T, whiten, points, cost, iterations, converged)
 
 
@@ -89,46 +89,51 @@ def _fixed_point(R: Tensor, t: Tensor, span: Tensor) -> Tensor:
 def _descended(kind: str, joints: Joints, T: Tensor, whiten: Tensor, levers: Tensor) -> tuple[Joints, Tensor, Tensor]:
     """Joints of least cost by Levenberg-Marquardt, its iterations [B], and whether they converged [B]."""
     joints = tuple(a.clone() for a in joints)
-    r = _residuals(kind, joints, T, whiten)
-    cost, damping = (r * r).sum(-1), torch.full_like(T[:, 0, 0, 0], 1e-6)
+    x = _left_over(kind, joints, T)
+    cost, damping = _whitened(whiten, x).square().sum(-1), torch.full_like(T[:, 0, 0, 0], 1e-6)
+    observed = x[0].numel()
     last_gain = torch.full_like(cost, math.inf)
     iterations = torch.zeros_like(cost, dtype=torch.long)
     converged = torch.full_like(iterations, kind == "fixed", dtype=torch.bool)
     for k in range(_MAX_ITERATIONS):
-        hopeless = cost > _HOPELESS * r.shape[1]
+        hopeless = cost > _HOPELESS * observed
         open_ = (~converged & ~(hopeless & (k >= _MAX_HOPELESS))).nonzero()[:, 0]
         if len(open_) == 0:
             break
-        now, T_now, whiten_now = tuple(a[open_] for a in joints), T[open_], whiten[open_]
-        H, g, scale = normal_equations(_jacobian(kind, now, T_now, whiten_now), r[open_])
+        now, x_now, whiten_now = tuple(a[open_] for a in joints), x[open_], whiten[open_]
+        J = _jacobian(kind, now, x_now, whiten_now)
+        H, g, scale = normal_equations(J, _whitened(whiten_now, x_now))
         step = torch.linalg.solve(H + damping[open_, None, None] * torch.eye(H.shape[-1]).to(H), -g) / scale
         trial = moved(kind, now, step, levers[open_])
-        r_trial = _residuals(kind, trial, T_now, whiten_now)
-        trial_cost = (r_trial * r_trial).sum(-1)
+        x_trial = _left_over(kind, trial, T[open_])
+        trial_cost = _whitened(whiten_now, x_trial).square().sum(-1)
         better, gain = trial_cost <= cost[open_], cost[open_] - trial_cost
         # Where no step goes down any more only rounding is left. Far axes creep along their valley to no purpose.
         tolerance = torch.where(hopeless[open_], 1e-4, 1e-8)
-        creeps = (gain > 0.25 * last_gain[open_]) & (gain <= _CREEP * (cost[open_] / r.shape[1]).clamp_min(1))
+        creeps = (gain > 0.25 * last_gain[open_]) & (gain <= _CREEP * (cost[open_] / observed).clamp_min(1))
         done = creeps | (gain <= tolerance * cost[open_] + 1e-16)
         converged[open_] = torch.where(better, done, damping[open_] > 1e6)
         last_gain[open_] = torch.where(better, gain, last_gain[open_])
         damping[open_] = torch.where(better, (damping[open_] / 10).clamp_min(1e-12), damping[open_] * 10)
         iterations[open_] += 1
         found = open_[better]
-        for a, b in zip((*joints, r, cost), (*trial, r_trial, trial_cost), strict=True):
+        for a, b in zip((*joints, x, cost), (*trial, x_trial, trial_cost), strict=True):
             a[found] = b[better]
     return joints, iterations, converged
 
 
-def _residuals(kind: str, joints: Joints, T: Tensor, whiten: Tensor) -> Tensor:
-    """What the model leaves, T = model exp(x), in standard deviations [B, 6 n]."""
-    x = se3_log(inverse(model_motions(kind, joints)) @ T)
+def _left_over(kind: str, joints: Joints, T: Tensor) -> Tensor:
+    """The small motions x [B, n, 6] that the model leaves: T = model exp(x)."""
+    return se3_log(inverse(model_motions(kind, joints)) @ T)
+
+
+def _whitened(whiten: Tensor, x: Tensor) -> Tensor:
+    """Residuals [B, 6 n]: small motions in standard deviations."""
     return (whiten @ x[..., None]).flatten(1)
 
 
-def _jacobian(kind: str, joints: Joints, T: Tensor, whiten: Tensor) -> Tensor:
-    """Derivatives [B, 6 n, K] of the residuals by the parameters of `body_twists`."""
-    x = se3_log(inverse(model_motions(kind, joints)) @ T)
+def _jacobian(kind: str, joints: Joints, x: Tensor, whiten: Tensor) -> Tensor:
+    """Derivatives [B, 6 n, K] of the residuals, where x is left over, by the parameters of `body_twists`."""
     return -(whiten @ inverse_left_jacobian(x) @ body_twists(kind, joints)).flatten(1, 2)
 
 
@@ -192,7 +197,7 @@ def _covariances(
     `sign` [B, 1]: -1 where axis and values are to be turned round.
     """
     axis, _, _, values = joints
-    J = _jacobian(kind, joints, T, whiten)
+    J = _jacobian(kind, joints, _left_over(kind, joints, T), whiten)
     freedom = J.shape[1] - J.shape[2]
     inflation = (cost / freedom).clamp_min(1) if freedom > 0 else torch.ones_like(cost)
     C = inflation[:, None, None] * inverse_hessian(J)
