@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from label_exports import flat_name, write_coco, write_masks, write_yolo
+from label_exports import flat_name, without_labels, write_coco, write_masks, write_yolo
 from small_capture import FRAMES, SIZE, STATES, pose, write_state
-from test_label_import import without_labels
 
 from splatart_ns.capture.capture import Frame, State
 from splatart_ns.capture.formats import load_capture
