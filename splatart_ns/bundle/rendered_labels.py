@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.posing import moved_splat, normalized, observed_motions, part_features
 from splatart_ns.capture.capture import UNLABELLED, Camera, Capture, Frame, Normalization
 from splatart_ns.capture.images import read_image, read_sized, undistorted_points, write_png
-from splatart_ns.capture.mask_export import write_mask_classes
+from splatart_ns.capture.mask_export import mask_path, write_mask_classes
 from splatart_ns.errors import InputError
 from splatart_ns.files import new_folder, replacing
 from splatart_ns.geometry.camera import viewmat_from_opengl
@@ -64,11 +64,11 @@ def write_labels(
             for frame in state.frames:
                 if frame.labels is not None:
                     continue
-                name = PurePosixPath(state.name, *(p for p in PurePosixPath(frame.name).parts if p not in ("..", "/")))
+                name = mask_path(state, frame)
                 shares = _part_shares(splat, features, frame, capture.normalization)
                 most, place = shares.max(-1)
                 labels = torch.where(most >= _SURE, ids[place], UNLABELLED).numpy().astype(np.uint8)
-                write_png(folder / "labels" / name.with_suffix(".png"), labels)
+                write_png(folder / "labels" / name, labels)
                 _write_overlay(folder / "overlays" / name.with_suffix(".jpg"), frame, labels, colours)
                 object_ = labels != 0
                 doubtful = float((labels == UNLABELLED).sum() / max(1, object_.sum()))

@@ -7,12 +7,12 @@ import re
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from splatart_ns.capture.annotated_image import AnnotatedImage, Split
-from splatart_ns.capture.capture import UNLABELLED, CaptureError
+from splatart_ns.capture.capture import UNLABELLED, CaptureError, Frame, State
 from splatart_ns.capture.class_list import (
     BACKGROUND_NAMES,
     CLASS_LISTS,
@@ -119,3 +119,13 @@ def write_mask_classes(file: Path, names: Mapping[int, str]) -> None:
     """Write the names of masks' pixel values as a `_classes.csv`."""
     with file.open("w", encoding="utf-8", newline="") as opened:
         csv.writer(opened, lineterminator="\n").writerows([("Pixel Value", "Class"), *names.items()])
+
+
+def mask_path(state: State, frame: Frame) -> PurePosixPath:
+    """Where an export has the mask of a frame, so that it finds the frame again: `STATE/images/0001.png`, or
+    `STATE/images/0001.jpg.png` where the suffix alone tells two images of the state apart."""
+    path = PurePosixPath(frame.name)
+    bare = path.with_suffix("")
+    alike = sum(PurePosixPath(other.name).with_suffix("") == bare for other in state.frames)
+    inner = [part for part in (path if alike > 1 else bare).parts if part not in ("..", "/")]
+    return PurePosixPath(state.name, *inner[:-1], f"{inner[-1]}.png")

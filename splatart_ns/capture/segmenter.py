@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from splatart_ns.capture.capture import Capture, CaptureError, Frame, State
 from splatart_ns.capture.images import MAX_LABEL, read_image, read_sized, write_png
-from splatart_ns.capture.mask_export import write_mask_classes
+from splatart_ns.capture.mask_export import mask_path, write_mask_classes
 from splatart_ns.capture.values import parse_number, read_json, show
 from splatart_ns.errors import InputError
 from splatart_ns.files import new_folder
@@ -59,8 +59,7 @@ def segment(capture: Capture, prompts: Path, output: Path, segmenter: Segmenter)
             logits = segmenter(image, list(parts.values()))
             ids = np.array([names.index(name) + 1 for name in parts], np.uint8)
             labels = np.where(logits.max(axis=0) > 0, ids[logits.argmax(axis=0)], np.uint8(0))
-            inner = [part for part in PurePosixPath(frame.name).parts if part not in ("..", "/")]
-            write_png(folder / PurePosixPath(state.name, *inner).with_suffix(".png"), labels)
+            write_png(folder / mask_path(state, frame), labels)
         write_mask_classes(folder / "_classes.csv", dict(enumerate(names, start=1)))
     return len(wanted)
 

@@ -1,6 +1,8 @@
 import importlib.util
 import json
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from small_capture import SIZE, write_state
@@ -47,6 +49,25 @@ def test_labels_of_prompts_are_taken_back_by_the_import(capture, tmp_path):
     expected[2:12, 2:12] = 1
     expected[4:8, 4:6] = 3
     assert (read_labels(frame.labels) == expected).all()
+
+
+def test_images_that_differ_in_their_suffix_alone_have_masks_of_their_own(capture, tmp_path):
+    file = capture.path / "state_00/transforms.json"
+    meta = json.loads(file.read_text())
+    first, second = meta["frames"][:2]
+    twin = Path(first["file_path"]).with_suffix(".jpg")
+    image = cv2.imread(str(file.parent / second["file_path"]))
+    cv2.imwrite(str(file.parent / twin), image)
+    meta = json.loads(file.read_text().replace(second["file_path"], str(twin)))
+    file.write_text(json.dumps(meta))
+    capture = load_capture(capture.path)
+    names = {f"state_00/{path}": side for path, side in ((first["file_path"], 4), (str(twin), 8))}
+    asked = {name: {"door": {"box": [2, 2, 2 + side, 2 + side]}} for name, side in names.items()}
+    assert segment(capture, write_prompts(tmp_path, asked), tmp_path / "out", boxes) == 2
+    assert import_labels(capture.path, tmp_path / "out").labelled == 2
+    for frame in load_capture(capture.path).states[0].frames:
+        if side := names.get(f"state_00/{frame.name}"):
+            assert (read_labels(frame.labels) == 2).sum() == side**2
 
 
 @pytest.mark.parametrize(
