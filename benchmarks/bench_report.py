@@ -58,7 +58,9 @@ only settings that were run on all of them can be compared:
 GROWTH = """## Growth
 
 Fits of 100 steps a state from few views, so that no error is taken. Slopes are those of log seconds over log size, by
-least squares over all points, and between the two largest sizes, where less of it is constant; 1 is linear.
+least squares over all points, and between the two largest sizes, where less of it is constant; 1 is linear. Poses and
+joints are sought in the states after the first: of 5 there are four times as many as of 2, which as much time for each
+shows as a slope of 1.51.
 """
 
 
