@@ -2,17 +2,18 @@
 
 Usage:
     python benchmarks/room.py --output-dir /somewhere [--objects drawer hinge] [--labelled 10] [--quality draft]
+    python benchmarks/room.py --output-dir /somewhere --objects A.urdf B.urdf --worlds --jitter 0.2 --exposure 0.1
 
 Renders each object on the floor of a textured room, by cameras with radial and tangential distortion, as JPEGs without
 alpha or masks, in the folders that `ns-process-data` leaves; outlines a few frames by hand-drawn polygons (within a
-pixel) as COCO; then runs `splatart import`, `check`, `fit`, and `eval` against the truth, which lies apart. Finished
-steps are not repeated: remove what is to be made anew.
+pixel) as COCO; then runs `splatart import`, `check`, `fit`, and `eval` against the truth, which lies apart. With
+`--worlds` each state is in a world of its own, as COLMAP leaves states that were captured apart. Finished steps are not
+repeated: remove what is to be made anew.
 """
 
 import json
 import math
 import tempfile
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,9 +25,11 @@ from fit_table import COLUMNS, figures, splatart
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from spoil import another_world, jittered, placed_in
 
 from splatart_ns.capture.capture import Camera
 from splatart_ns.capture.images import write_png
+from splatart_ns.capture.joint_draws import draw_configurations
 from splatart_ns.capture.light import Light
 from splatart_ns.capture.procedural import write_object
 from splatart_ns.capture.ray_caster import RayCaster
@@ -60,11 +63,19 @@ class Options:
     output_dir: Path
     """Folder for captures and bundles."""
     objects: tuple[str, ...] = ("drawer", "hinge")
-    """Built-in objects."""
+    """Built-in objects, or URDF files, whose joint values are drawn as `splatart synth` does."""
     frames: int = 60
     """Frames of each state; every 8th is a test frame, as `splatart` chooses them."""
     labelled: int = 10
     """How many of them are labelled."""
+    worlds: bool = False
+    """Give the second state a world of its own: any rotation, a scale of 0.5 to 2."""
+    jitter: float = 0.0
+    """How many degrees, and percent of their distance, cameras are off (see spoil.py)."""
+    exposure: float = 0.0
+    """How much lighter or darker images are, at most: 0.1 is 0.9 to 1.1 times."""
+    seed: int = 0
+    """Of joint values, views, and all that is random."""
     quality: str = "standard"
     """Of `splatart fit`."""
 
@@ -72,9 +83,10 @@ class Options:
 def main(options: Options) -> None:
     table = Table("object", "labelled", "s", *COLUMNS, box=SIMPLE_HEAD, pad_edge=False)
     for name in options.objects:
-        folder = options.output_dir / f"{name}_{options.frames}"
+        path = Path(name)
+        folder = options.output_dir / f"{path.parent.name + '_' + path.stem if path.suffix else name}_{options.frames}"
         if not (folder / "truth/ground_truth.json").exists():
-            write_room(name, folder, options.frames)
+            write_room(name, folder, options)
         capture, bundle = (folder / f"{what}_{options.labelled}" for what in ("capture", "bundle"))
         bundle = bundle.with_name(f"{bundle.name}_{options.quality}")
         if not capture.exists():
@@ -82,22 +94,27 @@ def main(options: Options) -> None:
             states = sorted(folder.glob("phone_*"))
             splatart("import", *states, "--labels", export, "--output-dir", capture)
         splatart("check", capture)
-        splatart("fit", capture, "--output-dir", bundle, "--quality", options.quality)
+        worlds = ("--worlds", "similar") if options.worlds else ()
+        splatart("fit", capture, "--output-dir", bundle, "--quality", options.quality, *worlds)
         splatart("eval", bundle, "--data", folder / "truth")
         metrics, report = (json.loads((bundle / f"{file}.json").read_text()) for file in ("metrics", "report"))
         table.add_row(name, str(options.labelled), f"{report['seconds']:.0f}", *figures(metrics))
     Console().print(table)
 
 
-def write_room(name: str, folder: Path, frames: int) -> None:
+def write_room(name: str, folder: Path, options: Options) -> None:
     """`phone_0`, `phone_1`: what a phone and ns-process-data leave. `truth`: a capture with all labels, silhouettes and
     ground_truth.json."""
     with tempfile.TemporaryDirectory() as temporary:
-        robot = read_urdf(write_object(name, Path(temporary)))
-        scene = Scene.of(robot, {}, part_surfaces(robot, {}), [robot.complete(values) for values in OBJECTS[name]])
-    distance = scene.camera_distance(_FIELD)
-    for k, values in enumerate(scene.configurations):
-        _write_state(folder, scene, values, distance, frames, k)
+        robot = read_urdf(write_object(name, Path(temporary)) if name in OBJECTS else Path(name))
+        surfaces = part_surfaces(robot, {})
+    if name in OBJECTS:
+        configurations = [robot.complete(values) for values in OBJECTS[name]]
+    else:
+        configurations = draw_configurations(robot, {}, surfaces, 2, options.seed)
+    scene = Scene.of(robot, {}, surfaces, configurations)
+    for k in range(len(configurations)):
+        _write_state(folder, scene, k, options)
     (folder / "truth/ground_truth_points").mkdir()
     for i, surface in scene.placed(scene.configurations[0]).items():
         points = surface.sample(POINTS_PER_PART, np.random.default_rng(i)).astype(np.float32)
@@ -106,36 +123,46 @@ def write_room(name: str, folder: Path, frames: int) -> None:
     (folder / "truth/ground_truth.json").write_text(json.dumps(truth, indent=1))
 
 
-def _write_state(folder: Path, scene: Scene, values: Mapping[str, float], distance: float, frames: int, k: int) -> None:
-    rng = np.random.default_rng([1, k])
-    parts = scene.placed(values)
-    floor = min(surface.corners[..., 2].min() for surface in parts.values()) - 1e-4
+def _write_state(folder: Path, scene: Scene, k: int, options: Options) -> None:
+    rng, spoiling = (np.random.default_rng([stream, k + 1000 * options.seed]) for stream in (1, 2))
+    parts, distance = scene.placed(scene.configurations[k]), scene.camera_distance(_FIELD)
+    placed = [surface for values in scene.configurations for surface in scene.placed(values).values()]
+    floor = min(surface.corners[..., 2].min() for surface in placed) - 1e-4
     caster = RayCaster({**parts, 0: _room(scene.centre, floor, 2.2 * distance)})
     phone, truth = folder / f"phone_{k}", folder / f"truth/state_{k:02d}"
     (phone / "images").mkdir(parents=True)
-    entries = []
-    for i, T in enumerate(camera_poses(frames, scene.centre, distance, "hemisphere", rng)):
+    true_poses = camera_poses(options.frames, scene.centre, distance, "hemisphere", rng)
+    poses = true_poses.copy()
+    jittered(poses, np.ones(len(poses), bool), math.radians(options.jitter), spoiling)
+    world = another_world(spoiling) if options.worlds and k > 0 else (1.0, np.eye(3), np.zeros(3))
+    entries: dict[Path, list[dict]] = {phone: [], truth: []}
+    for i, (T, told) in enumerate(zip(true_poses, poses, strict=True)):
         seen = caster.render(CAMERA, T, LIGHT)
         file = f"images/frame_{i + 1:05d}"
         alpha = seen.rgba[..., 3:] / 255.0
         rgb = np.rint(seen.rgba[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
-        cv2.imwrite(str(phone / f"{file}.jpg"), rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
-        entries.append({"file_path": f"{file}.jpg", "transform_matrix": T.tolist(), "colmap_im_id": i + 1})
         write_png(truth / f"{file}.png", np.ascontiguousarray(rgb[..., ::-1]))
         write_png(truth / f"{file}_parts.png", seen.part_ids)
         write_png(truth / f"{file}_mask.png", seen.silhouette.astype(np.uint8) * 255)
+        gain = 1 + options.exposure * spoiling.uniform(-1, 1)
+        taken = np.rint(gain * rgb[..., ::-1]).clip(0, 255).astype(np.uint8)
+        cv2.imwrite(str(phone / f"{file}.jpg"), taken, [cv2.IMWRITE_JPEG_QUALITY, 95])
+        own = {"file_path": f"{file}.jpg", "colmap_im_id": i + 1}
+        entries[phone].append({**own, "transform_matrix": placed_in(world, told).tolist()})
+        own = {
+            "file_path": f"{file}.png",
+            "semantics_path": f"{file}_parts.png",
+            "object_mask_path": f"{file}_mask.png",
+        }
+        entries[truth].append({**own, "transform_matrix": placed_in(world, T).tolist()})
     k1, k2, _, _, p1, p2 = CAMERA.distortion
     meta = {
         **{"w": CAMERA.width, "h": CAMERA.height, "fl_x": CAMERA.fx, "fl_y": CAMERA.fy, "cx": CAMERA.cx},
         **{"cy": CAMERA.cy, "k1": k1, "k2": k2, "p1": p1, "p2": p2, "camera_model": "OPENCV"},
     }
-    (phone / "transforms.json").write_text(json.dumps({**meta, "frames": entries}))
-    for entry in entries:
-        stem = entry["file_path"].removesuffix(".jpg")
-        entry["file_path"] = f"{stem}.png"
-        entry |= {"semantics_path": f"{stem}_parts.png", "object_mask_path": f"{stem}_mask.png"}
+    (phone / "transforms.json").write_text(json.dumps({**meta, "frames": entries[phone]}))
     meta["semantic_classes"] = ["background", *scene.ids]
-    (truth / "transforms.json").write_text(json.dumps({**meta, "frames": entries}))
+    (truth / "transforms.json").write_text(json.dumps({**meta, "frames": entries[truth]}))
 
 
 def _room(centre: np.ndarray, floor: float, half: float) -> Surface:

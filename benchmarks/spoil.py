@@ -47,18 +47,34 @@ def main(options: Options) -> None:
         train = np.array([frame["file_path"] in meta["train_filenames"] for frame in meta["frames"]])
         jittered(poses, train, math.radians(options.jitter), rng)
         if options.worlds and k > 0:
-            scale, R = 2.0 ** rng.uniform(-1, 1), Rotation.random(random_state=rng).as_matrix()
-            shift = rng.uniform(-5, 5, 3)
-            poses[:, :3, :3] = R @ poses[:, :3, :3]
-            poses[:, :3, 3] = scale * poses[:, :3, 3] @ R.T + shift
-            meta["depth_unit_scale_factor"] = scale * meta.get("depth_unit_scale_factor", 1e-3)
-            print(f"{file.parent.name}: scale {scale:.6f}")
+            world = another_world(rng)
+            poses = [placed_in(world, pose) for pose in poses]
+            meta["depth_unit_scale_factor"] = world[0] * meta.get("depth_unit_scale_factor", 1e-3)
+            print(f"{file.parent.name}: scale {world[0]:.6f}")
         for frame, pose in zip(meta["frames"], poses, strict=True):
             frame["transform_matrix"] = pose.tolist()
         file.write_text(json.dumps(meta, indent=1))
         if options.exposure > 0:
             for name in meta["train_filenames"]:
                 expose(file.parent / name, 1 + options.exposure * rng.uniform(-1, 1))
+
+
+World = tuple[float, np.ndarray, np.ndarray]
+"""A similarity: scale, rotation [3, 3], shift [3]."""
+
+
+def another_world(rng: np.random.Generator) -> World:
+    """Any rotation, a scale of 0.5 to 2."""
+    return 2.0 ** rng.uniform(-1, 1), Rotation.random(random_state=rng).as_matrix(), rng.uniform(-5, 5, 3)
+
+
+def placed_in(world: World, pose: np.ndarray) -> np.ndarray:
+    """A camera's pose [4, 4] in another world."""
+    scale, R, shift = world
+    pose = pose.copy()
+    pose[:3, :3] = R @ pose[:3, :3]
+    pose[:3, 3] = scale * R @ pose[:3, 3] + shift
+    return pose
 
 
 def jittered(poses: np.ndarray, chosen: np.ndarray, size: float, rng: np.random.Generator) -> None:
