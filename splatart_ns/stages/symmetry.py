@@ -66,6 +66,11 @@ HARDLY_ROUND = 2.0
 """And this many times, by turns of `DIP` and a step, where half a turn shows that a part is not round, but silhouettes
 are blind to its turn. Wheels that are half hidden or lit from one side, knobs and a turntable that turned measured 1.0
 to 1.6, 20 parts that rest 3.3 to 29."""
+CLEARLY, CLEAR_SHARE = 1.5, 0.3
+"""Or, for cameras that are off make all cost more, this many times by turns of twice as much, and this share of what the
+worst of all turns costs more: what is lit from one side costs (1 - cos 30 deg) / 2 of that, or its root, 0.07 to 0.26.
+A fridge's body seen from above by such cameras measured 1.9 and 0.38 (1.4 in place of `HARDLY_ROUND`), three parts
+that rest 5.5 to 13 and 0.38 to 0.56, nine wheels 1.2 and 0.07 at most."""
 TOLD_SHARE = 0.05
 """And by this share of what the worst costs more: else it may be light, whose wide dips measured 0.02 at most."""
 UNTURNED = 5
@@ -209,10 +214,12 @@ def _told_turn(pair: PartPair, T: Tensor, twist: Tensor) -> tuple[float, bool]:
 
 def _rests(pair: PartPair, T: Tensor, twist: Tensor) -> bool:
     """Whether the images tell that a part, whose motion T [4, 4] hardly turns it, has not turned about a twist [6]."""
-    angles = torch.arange(-DIP - STEP, DIP + STEP + 1, STEP).to(T).deg2rad()
-    pair = replace(pair, chroma_weight=CHROMA_WEIGHT, brightness_weight=1.0)
-    cost = pair.cost(se3_exp(angles[:, None] * twist) @ T)
-    return bool(torch.minimum(cost[0], cost[-1]) > HARDLY_ROUND * cost.amin())
+    _, cost = _swept(replace(pair, chroma_weight=CHROMA_WEIGHT, brightness_weight=1.0), T, twist)
+    near = DIP // STEP + 1
+    best = cost.roll(near)[: 2 * near + 1].amin()
+    some, more = (torch.minimum(cost[steps], cost[-steps]) for steps in (near, 2 * near))
+    clearly = more > CLEARLY * best and more - best > CLEAR_SHARE * (cost.amax() - best)
+    return bool(some > HARDLY_ROUND * best or clearly)
 
 
 def _swept(pair: PartPair, T: Tensor, twist: Tensor) -> tuple[Tensor, Tensor]:

@@ -188,6 +188,22 @@ def test_a_bar_whose_turn_silhouettes_hardly_tell_rests(hardly_round, monkeypatc
     assert torch.equal(settled, EYE) and not untold.any()
 
 
+def by_cameras_that_are_off(scene, degrees=0.35):
+    splats, views = scene
+    rng = torch.Generator().manual_seed(0)
+    off = [[se3_exp(math.radians(degrees) * torch.randn(6, generator=rng)) for _ in some] for some in views]
+    moved = [[replace(v, viewmat=d @ v.viewmat) for v, d in zip(*both, strict=True)] for both in zip(views, off)]
+    return splats, tuple(moved)
+
+
+def test_cameras_that_are_off_tell_that_a_bar_rests_and_not_that_a_wheel_does(under_a_fork):
+    """All turns cost more then, so that those by a few degrees hardly cost more than none."""
+    bar = by_cameras_that_are_off(scene(tilted_box, EYE, size=(0.5, 0.4, 0.3)))
+    for seen, rests in ((bar, True), (by_cameras_that_are_off(under_a_fork), False)):
+        pair = part_pair(*seen, 2, VIEWS, 1500)
+        assert symmetry._rests(pair, EYE, about(TILT[:3, 2])) == rests
+
+
 def test_what_tells_that_a_hardly_round_part_rests_may_show_in_some_of_the_views(
     under_a_fork, hardly_round, monkeypatch
 ):
