@@ -1,4 +1,4 @@
-"""Joint values for rendering: what a person types or saved, sweeps over the observed range, trajectories in files."""
+"""Joint values for rendering: what a person types or saved, sweeps over the joints' ranges, trajectories in files."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def read_configuration(path: Path, bundle: Bundle) -> Configuration:
 
 
 def sweep(bundle: Bundle, base: Mapping[str, float | list[float]], frames_per_joint: int) -> list[Configuration]:
-    """One movable joint after the other over what was observed, there and back, the others as in `base`.
+    """One movable joint after the other over its range, there and back, the others as in `base`.
 
     A joint of one freedom moves over its range like a cosine; it begins and ends at its value in `base` (0 where it has
     none), or at the end of its range next to that. One of several goes through its values at the states in turn, and
@@ -100,7 +100,7 @@ def _sweep_values(joint: Joint, start: float | list[float], frames: int) -> list
         states = np.arange(len(joint.values))
         at = len(states[1:]) * (1 - np.cos(2 * np.pi * np.arange(frames) / frames)) / 2
         return np.stack([np.interp(at, states, column) for column in joint.values.numpy().T], axis=1).tolist()
-    low, high = joint.limits
+    ((low, high),) = joint.ranges
     if low == high:
         return []
     start = min(max(start, low), high)

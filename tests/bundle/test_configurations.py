@@ -120,6 +120,12 @@ def test_a_sweep_of_joints_that_did_not_move_is_one_frame(bundle):
     assert sweep(bundle, {"hinge": 0.3}, 8) == [{"hinge": 0.3}]
 
 
+def test_a_sweep_stays_within_limits_that_somebody_narrowed(bundle):
+    bundle.joints[1].limits = (0.0, 0.3)
+    values = [q["hinge"] for q in sweep(bundle, {}, 8) if "hinge" in q]
+    assert min(values) == 0.0 and max(values) == pytest.approx(0.3)
+
+
 def test_a_trajectory_has_a_row_a_frame(bundle, tmp_path):
     path = tmp_path / "q.csv"
     path.write_text("\ufeffslide, hinge\n-0.1,45deg\n\n0,1.5\r\n", encoding="utf-8")
