@@ -154,6 +154,16 @@ def test_a_wrong_file_fails(objects, tmp_path, form):
     assert any(c.verdict == "failed" for c in checks), report(checks)
 
 
+@pytest.mark.parametrize("turns", [3, 1000])
+def test_an_animation_goes_the_long_way_of_many_turns(objects, tmp_path, turns):
+    bundle = objects.chain(["screw", "revolute"])
+    bundle.joints[0].limits = (0.0, turns * 2 * np.pi)
+    robot = objects.robot(bundle)
+    path = export(bundle, robot, "glb", tmp_path / "out")
+    assert_good(validate(path, "glb", bundle, robot))
+    assert path.stat().st_size < 1e6
+
+
 def test_a_screw_of_fine_pitch_passes_as_long_as_its_slide_follows_its_turn(objects, tmp_path):
     pytest.importorskip("mujoco")
     bundle = objects.chain(["screw"])
