@@ -259,13 +259,18 @@ def _check_unique(record: Record, key: str, values: list) -> None:
 
 
 def _check_tree(bundle: Bundle, record: Record) -> None:
-    """No part has two parents, the root has none, and every tree joint hangs from the root."""
+    """No part has two parents, the root has none, and every tree joint hangs from the root. A name means one joint."""
     children = [joint.child for joint in bundle.joints if joint.in_tree]
     for name in bundle.part_names:
         most = 0 if name == bundle.root else 1
         if children.count(name) > most:
             found = f"give part '{name}' {children.count(name)} parents in the tree"
             record.fail("joints", found, "the root has none and every other part at most one")
+    movers = {joint.child: joint for joint in bundle.joints if joint.in_tree}
+    for joint in movers.values():
+        if (other := movers.get(joint.name, joint)) is not joint:
+            found = f"call joint '{joint.name}' as the part that joint '{other.name}' moves"
+            record.fail("joints", found, "give the joint another name: a joint goes by its name or by its part's")
     hanging = {joint.child for joint in bundle.tree_joints}
     if lost := [name for name in children if name not in hanging]:
         record.fail(

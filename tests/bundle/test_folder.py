@@ -131,6 +131,7 @@ PART, JOINT = ("parts", 1), ("joints", 1)
         (set_(*PART, "motion_covariance", 0, value=[[1.0]]), "motion_covariance"),
         (set_(*JOINT, "type", value="ball"), "known are"),
         (set_(*JOINT, "name", value="slide"), "twice"),
+        (set_(*JOINT, "name", value="latch"), "call joint 'latch' as the part that joint 'slide' moves"),
         (set_(*JOINT, "parent", value="nobody"), "parent"),
         (set_(*JOINT, "parent", value="door"), "joins two parts"),
         (set_(*JOINT, "parent", value="latch"), "way to the root"),
@@ -187,6 +188,11 @@ def test_every_missing_key_is_named(folder):
             path.write_text(json.dumps(value))
             with pytest.raises(InputError, match=f"'{key}' of .* is missing"):
                 load_bundle(folder)
+
+
+def test_a_joint_may_have_the_name_of_the_part_that_it_moves(folder):
+    rewrite(folder, set_(*JOINT, "name", value="door"))
+    assert load_bundle(folder).tree_joint("door").child == "door"
 
 
 def test_a_part_may_hang_on_nothing(folder):
