@@ -190,6 +190,13 @@ def test_every_missing_key_is_named(folder):
                 load_bundle(folder)
 
 
+def test_a_key_that_an_object_has_twice_is_named(folder):
+    path = folder / "articulation.json"
+    path.write_text(path.read_text().replace('"pitch"', '"limits": [0, 1], "pitch"', 1))
+    with pytest.raises(InputError, match=r'articulation\.json: an object has the key "limits" twice; keep one of them'):
+        load_bundle(folder)
+
+
 def test_a_joint_may_have_the_name_of_the_part_that_it_moves(folder):
     rewrite(folder, set_(*JOINT, "name", value="door"))
     assert load_bundle(folder).tree_joint("door").child == "door"
