@@ -154,6 +154,17 @@ def test_a_wrong_file_fails(objects, tmp_path, form):
     assert any(c.verdict == "failed" for c in checks), report(checks)
 
 
+def test_an_object_too_small_for_mujocos_urdf_reader_is_said_to_be(objects, tmp_path):
+    pytest.importorskip("mujoco")
+    bundle = objects.chain(["revolute"])
+    robot = objects.robot(bundle, scale=1e-5)
+    checks = report(validate(export(bundle, robot, "urdf", tmp_path / "urdf"), "urdf", bundle, robot))
+    verdict, found = checks["mujoco", "link poses"]
+    assert verdict == "failed"
+    assert "too small for MuJoCo's URDF reader; give a larger --scale, or --format mjcf" in found
+    assert_good(validate(export(bundle, robot, "mjcf", tmp_path / "mjcf"), "mjcf", bundle, robot))
+
+
 @pytest.mark.parametrize("turns", [3, 1000])
 def test_an_animation_goes_the_long_way_of_many_turns(objects, tmp_path, turns):
     bundle = objects.chain(["screw", "revolute"])
