@@ -91,10 +91,9 @@ class Shards(Sequence[Entry]):
 
 def check_no_others(shards: Shards, out: Storage) -> None:
     """Raise InputError where the output holds a shard that is none of these: who trains on all would read it too."""
-    folders, _ = out.children("")
-    names = {entry.name for entry in shards}
-    for name in sorted(folders):
-        if re.fullmatch(r"shard-\d{6,}", name) and name not in names and _IMAGES in out.children(name)[1]:
+    for name in sorted(out.children("")[0]):
+        number = re.fullmatch(r"shard-(\d{6,})", name)
+        if number and int(number[1]) >= len(shards) and _IMAGES in out.children(name)[1]:
             found = f"holds {name}, of a run with more shards than these {len(shards)}"
             raise InputError(f"{out.url}: {found}; remove it, or give another --output-dir.")
 

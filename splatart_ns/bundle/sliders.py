@@ -28,8 +28,8 @@ def unit_name(turns: bool, length_unit: str) -> str:
 
 
 def slider_range(low: float, high: float) -> tuple[float, float, float]:
-    """Ends and step of a slider for a range from `low` to `high`: half as much more on both sides, and a
-    step of 1, 0.1, 0.01, ... that makes hundreds of places."""
+    """Ends and step of a slider for a range from `low` to `high`: half as much more on both sides, and a step of 1,
+    0.1, 0.01, ... that makes hundreds of places."""
     beyond = max(0.5 * (high - low), 1e-3)
     decimals = 2 - math.floor(math.log10(high - low + 2 * beyond))
     step = 10.0**-decimals
