@@ -145,7 +145,7 @@ def _check_simulation(path: Path, robot: Robot) -> list[Check]:
     if run.slowest:
         found += f"; moved across {run.reached:.0%} of it ('{run.slowest}')"
     strayed = run.strayed / robot.size
-    if any(freedom.mimic is not None for freedom in robot.freedoms):
+    if strayed:
         found += f"; what follows others strayed by {strayed:.1%} of the object's size"
     if run.touched:
         found += f"; touched: {_pairs(run.touched)}"
