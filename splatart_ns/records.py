@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.errors import InputError
+from splatart_ns.shape import repeated_key
 
 LONGEST = 1e18
 """Numbers are below it, so that their squares are float32 numbers."""
@@ -110,12 +111,19 @@ def _shown(value: Any) -> str:
 
 def read_record(path: Path, mend: str) -> Record:
     """The JSON object in a file; `mend` says what to do where there is no such file."""
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if (key := repeated_key(pairs)) is not None:
+            raise InputError(f"{path}: an object has the key {_shown(key)} twice; keep one of them")
+        return dict(pairs)
+
     if os.path.exists(path) and not os.path.isfile(path):  # a pipe would never end
         raise InputError(f"{path}: is not a file; {mend}")
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path}: is larger than {_MOST_BYTES >> 20} MiB; {mend}")
-        value = json.loads(path.read_text(encoding="utf-8-sig"), parse_constant=_no_constant)
+        text = path.read_text(encoding="utf-8-sig")
+        value = json.loads(text, parse_constant=_no_constant, object_pairs_hook=unique)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {mend}") from error
     except (ValueError, RecursionError) as error:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 NUMBER = float
@@ -16,6 +18,15 @@ def parse(data: bytes | None, shape: Any) -> Any | None:
     except (ValueError, RecursionError):
         return None
     return value if has_shape(value, shape) else None
+
+
+def repeated_key(pairs: Sequence[tuple[str, Any]]) -> str | None:
+    """The first key that an object has twice, of which `json` would take the last without a word; None for none.
+
+    For an `object_pairs_hook`.
+    """
+    times = Counter(key for key, _ in pairs)
+    return next((key for key in times if times[key] > 1), None)
 
 
 def has_shape(value: Any, shape: Any) -> bool:

@@ -16,11 +16,11 @@ BELOW = {
     "shape": set(),
     "threads": set(),
     "files": {"errors"},
-    "records": {"errors"},
+    "records": {"errors", "shape"},
     "geometry": {"errors"},
     "splats": {"errors", "files", "geometry"},
     "rasterize": {"errors", "geometry", "splats", "threads"},
-    "capture": {"errors", "files", "geometry", "plain_yaml"},
+    "capture": {"errors", "files", "geometry", "plain_yaml", "shape"},
     "stages": {"capture", "errors", "geometry", "rasterize", "splats", "threads"},
 }
 BELOW["bundle"] = BELOW["stages"] | {"files", "records", "stages"}

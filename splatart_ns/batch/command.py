@@ -13,7 +13,7 @@ from splatart_ns.batch.entry import Entry, check_apart, read_entries
 from splatart_ns.batch.fitting import Fitting
 from splatart_ns.batch.pool import ProcessPool
 from splatart_ns.batch.progress import LiveProgress
-from splatart_ns.batch.shards import Sharding, ShardOptions, Shards, find_bundles
+from splatart_ns.batch.shards import Sharding, ShardOptions, Shards, check_no_others, find_bundles
 from splatart_ns.batch.stage import Recipe
 from splatart_ns.batch.storage import open_storage
 from splatart_ns.errors import InputError
@@ -46,6 +46,7 @@ def write_shards(
 ) -> int:
     """Render labelled images of all bundles below a source; returns the exit code."""
     entries = Shards(source, find_bundles(source), options)
+    check_no_others(entries, open_storage(out_url))
     return _run(entries, out_url, Sharding(options, rasterizer), address, True, console, "shards")
 
 

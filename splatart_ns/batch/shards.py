@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import math
+import re
 import tarfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 _NEEDS_MB = 1500
 _ARTICULATION = "articulation.json"
+_IMAGES = "images.tar"
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,15 @@ class Shards(Sequence[Entry]):
         return Entry(f"shard-{number:06d}", self._url, {"first": first, "count": count, "of": total, "bundles": names})
 
 
+def check_no_others(shards: Shards, out: Storage) -> None:
+    """Raise InputError where the output holds a shard that is none of these: who trains on all would read it too."""
+    for name in sorted(out.children("")[0]):
+        number = re.fullmatch(r"shard-(\d{6,})", name)
+        if number and int(number[1]) >= len(shards) and _IMAGES in out.children(name)[1]:
+            found = f"holds {name}, of a run with more shards than these {len(shards)}"
+            raise InputError(f"{out.url}: {found}; remove it, or give another --output-dir.")
+
+
 @dataclass(frozen=True)
 class Sharding:
     """Shards as `SHARD/images.tar`."""
@@ -116,8 +127,8 @@ class Sharding:
 
         torch.set_num_threads(1)
         set_backend(self.rasterizer)
-        pictures = self._write(work, work.folder / "images.tar")
-        return {"images": work.entry.settings["count"], "thumbnails": pictures}, ["images.tar"]
+        pictures = self._write(work, work.folder / _IMAGES)
+        return {"images": work.entry.settings["count"], "thumbnails": pictures}, [_IMAGES]
 
     def outcome_shape(self, stage: str) -> Any:
         return {"digest": str} if stage == "read" else {"images": int, "thumbnails": [str]}

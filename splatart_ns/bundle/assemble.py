@@ -58,9 +58,11 @@ def _observed(bundle: Bundle, root_motion: Tensor, state: int) -> dict[str, Tens
 
 
 def _joint(joint: articulate.Joint, names: Mapping[int, str], in_tree: bool) -> Joint:
-    fit = joint.fit
+    fit, name = joint.fit, f"{names[joint.parent]}_to_{names[joint.child]}"
+    while name in names.values():  # a joint also goes by the part that it moves
+        name += "_joint"
     return Joint(
-        name=f"{names[joint.parent]}_to_{names[joint.child]}",
+        name=name,
         type=fit.type,
         parent=names[joint.parent],
         child=names[joint.child],

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from splatart_ns.splats.splat import Splat
@@ -46,8 +45,8 @@ class Joint:
     of freedom: (length, angle) for cylindrical, a rotation vector for spherical, a tangent (translation, rotation)
     for free. Zeros for fixed."""
     limits: tuple[float, float] | None
-    """The observed range of the value, a whole turn of a round part whose turns nothing tells; None for types with
-    more than one degree of freedom."""
+    """The observed range of the value, or what somebody gave instead; a whole turn of a round part whose turns nothing
+    tells. 0, where state 0 is, lies in it. None for types with more than one degree of freedom."""
     pitch: float = 0.0
     """Length per radian; 0 but for screws."""
     in_tree: bool = True
@@ -68,10 +67,10 @@ class Joint:
 
     @property
     def ranges(self) -> list[tuple[float, float]]:
-        """Of each of the joint's numbers: what its values, limits and 0, where state 0 is, lie between."""
+        """Of each of the joint's numbers: `limits` where they are given, else what its values lie between; with 0."""
         numbers = self.values.reshape(len(self.values), -1)
-        if self.limits is not None and numbers.shape[1] == 1:
-            numbers = torch.cat([numbers, numbers.new_tensor(self.limits)[:, None]])
+        if self.limits is not None:
+            numbers = numbers.new_tensor(self.limits)[:, None]
         return list(zip(numbers.amin(0).clamp_max(0).tolist(), numbers.amax(0).clamp_min(0).tolist(), strict=True))
 
 

@@ -106,7 +106,7 @@ def sweep_values(joint: Joint) -> Tensor:
     """Values [K] or [K, D] among which to look for that of a joint: in all a turn, in a slide three times its range."""
     if JOINT_DOFS[joint.type] > 1:
         return joint.values
-    low, high = joint.limits or (0.0, 0.0)
+    ((low, high),) = joint.ranges
     if joint.type == "revolute":
         turn = torch.arange(_TURN_SAMPLES, dtype=torch.float64) * (2 * math.pi / _TURN_SAMPLES)
         middle = (low + high) / 2

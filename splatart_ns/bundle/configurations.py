@@ -1,8 +1,9 @@
-"""Joint values for rendering: what a person types or saved, sweeps over the observed range, trajectories in files."""
+"""Joint values for rendering: what a person types or saved, sweeps over the joints' ranges, trajectories in files."""
 
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -79,7 +80,7 @@ def read_configuration(path: Path, bundle: Bundle) -> Configuration:
 
 
 def sweep(bundle: Bundle, base: Mapping[str, float | list[float]], frames_per_joint: int) -> list[Configuration]:
-    """One movable joint after the other over what was observed, there and back, the others as in `base`.
+    """One movable joint after the other over its range, there and back, the others as in `base`.
 
     A joint of one freedom moves over its range like a cosine; it begins and ends at its value in `base` (0 where it has
     none), or at the end of its range next to that. One of several goes through its values at the states in turn, and
@@ -100,7 +101,7 @@ def _sweep_values(joint: Joint, start: float | list[float], frames: int) -> list
         states = np.arange(len(joint.values))
         at = len(states[1:]) * (1 - np.cos(2 * np.pi * np.arange(frames) / frames)) / 2
         return np.stack([np.interp(at, states, column) for column in joint.values.numpy().T], axis=1).tolist()
-    low, high = joint.limits
+    ((low, high),) = joint.ranges
     if low == high:
         return []
     start = min(max(start, low), high)
@@ -109,19 +110,26 @@ def _sweep_values(joint: Joint, start: float | list[float], frames: int) -> list
 
 
 def read_trajectory(path: Path, bundle: Bundle) -> list[Configuration]:
-    """Configurations from a CSV file: a header of joint names, then a row of values (see `parse_value`) per frame."""
+    """Configurations from a CSV file: a header of joint names, then a row of values (see `parse_value`) per frame.
+
+    With commas between, or semicolons where the header has no comma.
+    """
     try:
         if Path(path).exists() and not Path(path).is_file():  # a pipe would never end
             raise InputError(f"{path}: is not a file; give a CSV file")
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            rows = [(i, row) for i, row in enumerate(csv.reader(file), start=1) if any(cell.strip() for cell in row)]
+        text = Path(path).read_text(encoding="utf-8-sig")
+        header = text.lstrip().partition("\n")[0]
+        delimiter = ";" if ";" in header and "," not in header else ","
+        lines = csv.reader(io.StringIO(text), delimiter=delimiter)
+        rows = [(i, row) for i, row in enumerate(lines, start=1) if any(cell.strip() for cell in row)]
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: is no CSV text ({error}); save it as UTF-8") from error
     if len(rows) < 2:
         raise InputError(f"{path}: has {len(rows)} lines; give a header of joint names and a row of values per frame")
-    joints = [_find(cell.strip(), bundle, f"{path}") for cell in rows[0][1]]
+    no_times = "; remove other columns, also of times: a row is a frame"
+    joints = [_find(cell.strip(), bundle, f"{path}", no_times) for cell in rows[0][1]]
     names = [joint.name for joint in joints]
     if len(set(names)) < len(names):
         raise InputError(f"{path}: the header names a joint twice; name each once")
@@ -134,10 +142,10 @@ def read_trajectory(path: Path, bundle: Bundle) -> list[Configuration]:
     return configurations
 
 
-def _find(name: str, bundle: Bundle, where: str) -> Joint:
+def _find(name: str, bundle: Bundle, where: str, mend: str = "") -> Joint:
     """The movable joint of this name, or that moves the part of this name."""
     joint = bundle.tree_joint(name)
     if joint is None or JOINT_DOFS[joint.type] == 0:
         known = ", ".join(movable_joints(bundle)) or "none"
-        raise InputError(f"{where}: no movable joint is called '{name}'; there are {known}")
+        raise InputError(f"{where}: no movable joint is called '{name}'; there are {known}{mend}")
     return joint

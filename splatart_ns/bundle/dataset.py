@@ -57,7 +57,7 @@ class Sample:
 class Dataset:
     """Samples by number, 0 and up without end: the same object, options and number give the same sample.
 
-    Every joint's observed range is cut into as many pieces as there are states, and each state has a value from another
+    Every joint's range is cut into as many pieces as there are states, and each state has a value from another
     piece, at the same place of each, so that any two states differ by a piece at least and many cover the range (a
     Latin hypercube, evenly spaced). A joint's freedoms are drawn apart.
     """

@@ -24,6 +24,8 @@ METRICS = "metrics.json"
 """What `splatart eval` writes beside it."""
 _VARIANCE = 1e300
 """Below which variances are: of what is hardly determined they are large."""
+_AT_ZERO = 1e-6
+"""Radian or length: how far from 0 a value at the first state may be, and limits about it, by rounding."""
 
 
 def save_bundle(bundle: Bundle, folder: Path) -> None:
@@ -190,14 +192,18 @@ def _read_joint(record: Record, num_states: int, parts: list[str]) -> Joint:
     if abs(float(axis.norm()) - 1) > 1e-4:
         record.fail("axis", f"has the length {float(axis.norm()):g}", "give a unit vector")
     values = record.tensor("values", (num_states,) if dofs <= 1 else (num_states, dofs))
-    if float(values[0].abs().max()) > 1e-6:
+    if float(values[0].abs().max()) > _AT_ZERO:
         record.fail("values", f"begins with {values[0].tolist()}", "the value at the first state is 0")
     limits = None
-    if dofs <= 1 or record.fields.get("limits") is not None:
+    if dofs <= 1:
         low, high = record.tensor("limits", (2,)).tolist()
         limits = (low, high)
         if low > high:
             record.fail("limits", f"is [{low}, {high}]", "give the lower limit first")
+        if low > _AT_ZERO or high < -_AT_ZERO:
+            record.fail("limits", f"is [{low}, {high}]", "give a range that holds 0, the value at the first state")
+    elif (given := record.fields.get("limits")) is not None:
+        record.fail("limits", f"is {given}, but a {kind} joint has {dofs} values", "give null")
     residual = record.number("residual")
     if residual < 0:
         record.fail("residual", f"is {residual}", "a distance is 0 or more")
@@ -253,13 +259,18 @@ def _check_unique(record: Record, key: str, values: list) -> None:
 
 
 def _check_tree(bundle: Bundle, record: Record) -> None:
-    """No part has two parents, the root has none, and every tree joint hangs from the root."""
+    """No part has two parents, the root has none, and every tree joint hangs from the root. A name means one joint."""
     children = [joint.child for joint in bundle.joints if joint.in_tree]
     for name in bundle.part_names:
         most = 0 if name == bundle.root else 1
         if children.count(name) > most:
             found = f"give part '{name}' {children.count(name)} parents in the tree"
             record.fail("joints", found, "the root has none and every other part at most one")
+    movers = {joint.child: joint for joint in bundle.joints if joint.in_tree}
+    for joint in movers.values():
+        if (other := movers.get(joint.name, joint)) is not joint:
+            found = f"call joint '{joint.name}' as the part that joint '{other.name}' moves"
+            record.fail("joints", found, "give the joint another name: a joint goes by its name or by its part's")
     hanging = {joint.child for joint in bundle.tree_joints}
     if lost := [name for name in children if name not in hanging]:
         record.fail(

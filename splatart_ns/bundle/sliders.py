@@ -28,8 +28,8 @@ def unit_name(turns: bool, length_unit: str) -> str:
 
 
 def slider_range(low: float, high: float) -> tuple[float, float, float]:
-    """Ends and step of a slider for what was observed from `low` to `high`: half as much more on both sides, and a
-    step of 1, 0.1, 0.01, ... that makes hundreds of places."""
+    """Ends and step of a slider for a range from `low` to `high`: half as much more on both sides, and a step of 1,
+    0.1, 0.01, ... that makes hundreds of places."""
     beyond = max(0.5 * (high - low), 1e-3)
     decimals = 2 - math.floor(math.log10(high - low + 2 * beyond))
     step = 10.0**-decimals
@@ -42,7 +42,7 @@ def slider_range(low: float, high: float) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class Slider:
-    """One degree of freedom of a bundle's joint; `low`, `high`, `step` and `observed` are in `unit`."""
+    """One degree of freedom of a bundle's joint; `low`, `high`, `step` and `ends` are in `unit`."""
 
     joint: str
     freedom: int
@@ -53,15 +53,15 @@ class Slider:
     low: float
     high: float
     step: float
-    observed: tuple[float, float]
+    ends: tuple[float, float]
     """Of the joint's `ranges`."""
 
     @property
     def note(self) -> str:
         """What is known of the range."""
-        if self.unit == "degree" and np.allclose(self.observed, (-180, 180)):
+        if self.unit == "degree" and np.allclose(self.ends, (-180, 180)):
             return "nothing tells how far it turned"
-        return f"observed {' to '.join(f'{x:.4g}' for x in sorted(set(self.observed)))} {self.unit}"
+        return f"range {' to '.join(f'{x:.4g}' for x in sorted(set(self.ends)))} {self.unit}"
 
     @property
     def units(self) -> float:

@@ -9,7 +9,6 @@ import json
 import math
 import os
 import reprlib
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -20,6 +19,7 @@ from splatart_ns.capture.capture import Camera, CaptureError
 from splatart_ns.capture.images import image_size, undistorted_camera
 from splatart_ns.errors import InputError
 from splatart_ns.plain_yaml import parse_yaml
+from splatart_ns.shape import repeated_key
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -58,12 +58,9 @@ def is_inside(folder: Path, path: Path) -> bool:
 
 def read_json(file: Path) -> dict[str, Any]:
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        """What else would take the last of two values without a word."""
-        values = dict(pairs)
-        if len(values) < len(pairs):
-            twice = next(key for key, times in Counter(key for key, _ in pairs).items() if times > 1)
-            raise CaptureError(file, f"an object has the key {show(twice)} twice", "keep one of them")
-        return values
+        if (key := repeated_key(pairs)) is not None:
+            raise CaptureError(file, f"an object has the key {show(key)} twice", "keep one of them")
+        return dict(pairs)
 
     try:
         value = json.loads(read_text(file), object_pairs_hook=unique)

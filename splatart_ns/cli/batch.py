@@ -49,7 +49,8 @@ class Shards:
     """Render labelled images of many bundles at random views and configurations, as WebDataset tar shards.
 
     The samples are those of `splatart render --dataset`. Run it again to make what is missing or changed: a shard
-    depends on its own bundles alone. Exit codes are those of `splatart batch`.
+    depends on its own bundles alone. A folder that holds more shards than these is refused. Exit codes are those of
+    `splatart batch`.
     """
 
     root: Annotated[str, tyro.conf.Positional]

@@ -75,7 +75,7 @@ class Export:
     density: float = 400.0
     """Of the parts, filled, in kg / m^3."""
     limit_margin: float = 0.05
-    """How much wider than the observed range joint limits are at both ends, as a share of the range."""
+    """How much wider than a joint's range its limits are at both ends, as a share of the range."""
     validate: bool = True
     """Load what was written in the programs that read it and compare the poses of all links."""
 

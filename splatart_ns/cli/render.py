@@ -32,14 +32,14 @@ class Render:
     """Joint values, joint=value, or part=value for the joint that moves it: radians, or degrees as 30deg, or a length;
     joints of several freedoms take as many, lengths first: ball=10deg,0,5deg. Joints not named are as in state 0."""
     sweep: bool = False
-    """Move one joint after the other over its observed range."""
+    """Move one joint after the other over its range."""
     trajectory: Path | None = None
-    """CSV file: a header of joints, and a row of values a frame; --set holds other joints."""
+    """CSV file (commas or semicolons): a header of joints, and a row of values a frame; --set holds other joints."""
     dataset: int | None = None
     """Write a capture with ground truth: so many images with part labels and depth at random views and configurations.
     Run it again to go on, or with more to add some."""
     states: int = 2
-    """Configurations of the dataset, each within the observed ranges; the images are dealt out to them."""
+    """Configurations of the dataset, each within the joints' ranges; the images are dealt out to them."""
     views: Literal["sphere", "hemisphere"] = "sphere"
     """See the object of the dataset from everywhere, or from above only."""
     seed: int = 0

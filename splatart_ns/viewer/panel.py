@@ -30,14 +30,14 @@ class Panel:
         self.sliders: list[viser.GuiInputHandle[float]] = []
         with gui.add_folder("Joints"):
             for slider in self._limits:
-                limits = sorted(set(slider.observed))
+                limits = sorted(set(slider.ends))
                 hint = f"{hints[slider.joint]}; {slider.note}"
                 marks = tuple((x, f"{x:.3g}") for x in limits)
                 ends = (slider.low, slider.high, slider.step)
                 label = _breakable(slider.label)
                 self.sliders.append(gui.add_slider(label, *ends, initial_value=0.0, marks=marks, hint=hint))
             self.reset = gui.add_button("Reset", hint="All joints as in state 0")
-            self.sweep = gui.add_checkbox("Sweep", False, hint="One joint after the other over what was observed")
+            self.sweep = gui.add_checkbox("Sweep", False, hint="One joint after the other over its range")
         self.parts: dict[str, viser.GuiInputHandle[bool]] = {}
         self._told = {name: "hangs on nothing" for name in bundle.part_names} | {bundle.root: "the root"}
         self._told |= {name: describe_joint(joint) for name, joint in joints.items()}

@@ -4,15 +4,19 @@ import io
 import json
 import shutil
 import tarfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from bundle_of_two import save_box
 from PIL import Image
+from rich.console import Console
 
 from splatart_ns.batch.batch import run_batch
+from splatart_ns.batch.command import write_shards
 from splatart_ns.batch.pool import ProcessPool
-from splatart_ns.batch.shards import Sharding, ShardOptions, Shards, find_bundles
+from splatart_ns.batch.shards import Sharding, ShardOptions, Shards, check_no_others, find_bundles
+from splatart_ns.batch.storage import open_storage
 from splatart_ns.errors import InputError
 
 OPTIONS = ShardOptions(images=10, shard_size=4, states=3, resolution=24)
@@ -92,6 +96,17 @@ def test_one_bundle_is_enough(bundles, make, tmp_path):
     told = make(bundles / "a", tmp_path, ShardOptions(images=2, states=2, resolution=24))
     assert set(told.status().values()) == {"done"}
     assert json.loads(members(tmp_path / "shard-000000/images.tar")["000000000.json"])["object"] == "a"
+
+
+def test_shards_that_fewer_images_would_leave_behind_are_refused(bundles, tmp_path):
+    for name in ("shard-000002", "shard-000003-mine", "notes"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "images.tar").touch()
+    (tmp_path / "shard-000004").mkdir()  # without images
+    check_no_others(Shards(str(bundles), ["a"], OPTIONS), open_storage(str(tmp_path)))
+    with pytest.raises(InputError, match=f"{tmp_path}: holds shard-000002, .* these 2; remove it, or give another"):
+        write_shards(str(bundles), str(tmp_path), replace(OPTIONS, images=8), "torch", None, Console())
+    assert (tmp_path / "shard-000002/images.tar").exists()
 
 
 @pytest.mark.parametrize("options", [{"images": 0}, {"shard_size": 0}, {"states": 0}])

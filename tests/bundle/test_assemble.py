@@ -19,8 +19,7 @@ def fit(kind: str, axis: torch.Tensor, value: float) -> JointFit:
     return JointFit(kind, axis, torch.zeros(3).double(), 0.0, torch.tensor([0.0, value]).double(), residual=1e-3)
 
 
-@pytest.fixture
-def assembled(bundle):
+def assemble(bundle, names=NAMES):
     tree = KinematicTree(
         [1, 2, 3, 4],
         root=1,
@@ -38,8 +37,13 @@ def assembled(bundle):
     motions = {1: eye, 2: far, 3: far, 4: far}
     zeros = torch.zeros(2, 6, 6).double()
     return assemble_bundle(
-        tree, {p: splat for p in NAMES}, motions, {p: zeros for p in NAMES}, NAMES, ["a", "b"], "metre", {"seed": 0}
+        tree, {p: splat for p in names}, motions, {p: zeros for p in names}, names, ["a", "b"], "metre", {"seed": 0}
     )
+
+
+@pytest.fixture
+def assembled(bundle):
+    return assemble(bundle)
 
 
 def test_parts_on_the_tree_move_as_their_joints_say(assembled):
@@ -69,6 +73,11 @@ def test_what_is_assembled_is_a_valid_bundle(assembled, tmp_path):
     save_bundle(assembled, tmp_path)
     assert [j.name for j in load_bundle(tmp_path).tree_joints] == ["body_to_door", "door_to_knob"]
     assert isinstance(assembled.parts[0].splat, Splat)
+
+
+def test_no_joint_has_the_name_of_a_part(bundle, tmp_path):
+    save_bundle(assemble(bundle, NAMES | {3: "body_to_door"}), tmp_path)
+    assert [j.name for j in load_bundle(tmp_path).tree_joints] == ["body_to_door_joint", "door_to_body_to_door"]
 
 
 def test_joints_of_more_freedom_are_saved_loaded_and_posed(bundle, tmp_path):

@@ -96,6 +96,14 @@ def test_a_sweep_starts_where_the_joint_is_set_and_keeps_the_others(bundle):
     assert max(q["hinge"] for q in frames) == pytest.approx(math.pi / 2, abs=0.05)
 
 
+def test_a_trajectory_may_have_semicolons(with_ball, tmp_path):
+    path = tmp_path / "q.csv"
+    path.write_text("closure;hinge\n0.1,30deg,-1;45deg\n")
+    assert read_trajectory(path, with_ball) == [
+        {"closure": pytest.approx([0.1, math.pi / 6, -1]), "hinge": pytest.approx(math.pi / 4)}
+    ]
+
+
 def test_a_joint_of_three_freedoms_takes_three_values(with_ball):
     (closure,) = parse_settings(["closure=0.1, 30deg,-1"], with_ball).values()
     assert closure == pytest.approx([0.1, math.pi / 6, -1])
@@ -120,6 +128,12 @@ def test_a_sweep_of_joints_that_did_not_move_is_one_frame(bundle):
     assert sweep(bundle, {"hinge": 0.3}, 8) == [{"hinge": 0.3}]
 
 
+def test_a_sweep_stays_within_limits_that_somebody_narrowed(bundle):
+    bundle.joints[1].limits = (0.0, 0.3)
+    values = [q["hinge"] for q in sweep(bundle, {}, 8) if "hinge" in q]
+    assert min(values) == 0.0 and max(values) == pytest.approx(0.3)
+
+
 def test_a_trajectory_has_a_row_a_frame(bundle, tmp_path):
     path = tmp_path / "q.csv"
     path.write_text("\ufeffslide, hinge\n-0.1,45deg\n\n0,1.5\r\n", encoding="utf-8")
@@ -135,6 +149,8 @@ def test_a_trajectory_has_a_row_a_frame(bundle, tmp_path):
         (b"", "has 0 lines"),
         (b"hinge\n", "has 1 lines"),
         (b"hinge,nobody\n1,2\n", "nobody"),
+        (b"time,hinge\n0,2\n", "called 'time'; there are hinge, slide; remove other columns, also of times"),
+        (b"hinge;slide\n0,5;1\n", "line 2: '0,5' is 2 numbers"),
         (b"hinge,hinge\n1,2\n", "twice"),
         (b"hinge,slide\n1\n", "line 2 has 1 values"),
         (b"hinge\n1\n1,2\n", "line 3 has 2 values"),

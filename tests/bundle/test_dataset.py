@@ -66,6 +66,13 @@ def test_a_round_part_whose_turns_nothing_tells_is_shown_turned(bundle):
     assert values.min() < -0.7 * np.pi and values.max() > 0.7 * np.pi
 
 
+def test_no_state_is_beyond_limits_that_somebody_narrowed(bundle):
+    bundle.joints[1].limits = (0.0, 0.3)
+    narrowed = Dataset(ArticulatedSplat(bundle), DatasetOptions(states=20))
+    values = [narrowed.configuration(k)["hinge"] for k in range(20)]
+    assert 0.0 <= min(values) < 0.02 and 0.28 < max(values) <= 0.3
+
+
 def test_a_joint_of_several_freedoms_stays_within_what_was_observed_of_each(bundle):
     joint = bundle.joints[0]
     joint.type, joint.limits, joint.values = "spherical", None, torch.tensor([[0.0, 0, 0], [0.3, 0, -0.2]]).double()

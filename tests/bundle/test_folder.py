@@ -131,6 +131,7 @@ PART, JOINT = ("parts", 1), ("joints", 1)
         (set_(*PART, "motion_covariance", 0, value=[[1.0]]), "motion_covariance"),
         (set_(*JOINT, "type", value="ball"), "known are"),
         (set_(*JOINT, "name", value="slide"), "twice"),
+        (set_(*JOINT, "name", value="latch"), "call joint 'latch' as the part that joint 'slide' moves"),
         (set_(*JOINT, "parent", value="nobody"), "parent"),
         (set_(*JOINT, "parent", value="door"), "joins two parts"),
         (set_(*JOINT, "parent", value="latch"), "way to the root"),
@@ -144,6 +145,9 @@ PART, JOINT = ("parts", 1), ("joints", 1)
         (set_(*JOINT, "values", value=[1.0, 2.0]), "first state is 0"),
         (set_(*JOINT, "limits", value=[1, 0]), "lower limit"),
         (set_(*JOINT, "limits", value=None), "limits"),
+        (set_(*JOINT, "limits", value=[0.2, 1.5]), r"is \[0.2, 1.5\]; give a range that holds 0"),
+        (set_(*JOINT, "limits", value=[-1.5, -0.2]), "holds 0"),
+        (set_("joints", 2, "limits", value=[0.0, 1.0]), r"a spherical joint has 3 values; give null"),
         (set_(*JOINT, "residual", value=-1), "residual"),
         (set_(*JOINT, "residual", value="0"), "residual"),
         (set_(*JOINT, "covariance", value=[]), "covariance"),
@@ -184,6 +188,18 @@ def test_every_missing_key_is_named(folder):
             path.write_text(json.dumps(value))
             with pytest.raises(InputError, match=f"'{key}' of .* is missing"):
                 load_bundle(folder)
+
+
+def test_a_key_that_an_object_has_twice_is_named(folder):
+    path = folder / "articulation.json"
+    path.write_text(path.read_text().replace('"pitch"', '"limits": [0, 1], "pitch"', 1))
+    with pytest.raises(InputError, match=r'articulation\.json: an object has the key "limits" twice; keep one of them'):
+        load_bundle(folder)
+
+
+def test_a_joint_may_have_the_name_of_the_part_that_it_moves(folder):
+    rewrite(folder, set_(*JOINT, "name", value="door"))
+    assert load_bundle(folder).tree_joint("door").child == "door"
 
 
 def test_a_part_may_hang_on_nothing(folder):

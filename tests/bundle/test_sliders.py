@@ -18,7 +18,7 @@ def test_a_sliders_range_holds_what_was_observed_in_round_steps(low: float, high
 def test_one_slider_a_freedom_with_unit_and_limits(bundle):
     hinge, slide = bundle_sliders(bundle)
     assert (hinge.label, slide.label) == ("hinge (degree)", "slide (metre)")
-    assert hinge.observed == pytest.approx((0, 90)) and slide.observed == pytest.approx((-0.25, 0))
+    assert hinge.ends == pytest.approx((0, 90)) and slide.ends == pytest.approx((-0.25, 0))
     assert hinge.low <= -45 and hinge.high >= 135
 
 
@@ -26,8 +26,8 @@ def test_a_round_part_whose_turns_nothing_tells_can_be_turned_all_round(bundle):
     told = bundle_sliders(bundle)[0]
     bundle.joints[1] = replace(bundle.joints[1], values=0 * bundle.joints[1].values, limits=(-math.pi, math.pi))
     hinge = bundle_sliders(bundle)[0]
-    assert hinge.observed == pytest.approx((-180, 180)) and hinge.low <= -180 and hinge.high >= 180
-    assert (told.note, hinge.note) == ("observed 0 to 90 degree", "nothing tells how far it turned")
+    assert hinge.ends == pytest.approx((-180, 180)) and hinge.low <= -180 and hinge.high >= 180
+    assert (told.note, hinge.note) == ("range 0 to 90 degree", "nothing tells how far it turned")
 
 
 def test_a_length_of_unknown_unit_is_called_a_length(bundle):
@@ -60,7 +60,13 @@ def test_a_joint_of_several_freedoms_has_as_many_sliders(bundle, kind, value, sh
     assert configuration(sliders, shown)["hinge"] == pytest.approx(value)
 
 
-def test_a_range_that_lacks_state_0_is_widened_to_it(bundle):
-    bundle.joints[1].values += 0.5
+def test_limits_that_somebody_edited_are_the_range_whatever_was_observed(bundle):
+    bundle.joints[1].limits = (0.0, 0.3)
     hinge = bundle_sliders(bundle)[0]
-    assert hinge.observed[0] == 0 and hinge.low <= 0
+    assert hinge.ends == pytest.approx((0, math.degrees(0.3))) and hinge.note == "range 0 to 17.19 degree"
+
+
+def test_limits_that_lack_state_0_by_rounding_are_widened_to_it(bundle):
+    bundle.joints[1].limits = (1e-7, 1.0)
+    hinge = bundle_sliders(bundle)[0]
+    assert hinge.ends[0] == 0 and hinge.low <= 0

@@ -44,7 +44,13 @@ class MujocoModel:
         import mujoco
 
         self._robot, self._mujoco = robot, mujoco
-        self.model = mujoco.MjModel.from_xml_path(str(path))
+        try:
+            self.model = mujoco.MjModel.from_xml_path(str(path))
+        except ValueError as error:
+            if "volume is too small" not in str(error):
+                raise
+            mend = "give a larger --scale, or --format mjcf"
+            raise ValueError(f"the object is too small for MuJoCo's URDF reader; {mend} ({error})") from error
         self.data = mujoco.MjData(self.model)
 
     def poses(self, values: Mapping[str, float]) -> Poses:

@@ -21,7 +21,7 @@ from splatart_ns.errors import InputError
 DENSITY = 400.0
 """kg / m^3, of the filled mesh: between hollow furniture and solid wood."""
 LIMIT_MARGIN = 0.05
-"""Of the observed range, by which limits are wider at both ends."""
+"""Of a joint's range, by which limits are wider at both ends."""
 _SIZES = (0.005, 50.0)
 """Metres, of objects that simulators can be trusted with."""
 _MOST, _MOST_MARGIN = 1e6, 100.0
@@ -70,7 +70,7 @@ def describe(
         name: Of the whole; made an identifier.
         scale: Metres per unit of the bundle; by default as its unit says, else 1.
         density: kg / m^3.
-        limit_margin: How much wider than the observed range the limits are at both ends, in ranges.
+        limit_margin: How much wider than a joint's range its limits are at both ends, in ranges.
 
     Raises:
         InputError: a scale, density or margin as in `check_numbers`.

@@ -42,7 +42,7 @@ def freedom_names(joint: Joint) -> list[str]:
 def freedoms(joint: Joint, names: Sequence[str], scale: float, margin: float) -> tuple[Freedom, ...]:
     """The freedoms of a joint, called `names`; none if it did not move.
 
-    Limits are the observed range, `margin` times its width wider at both ends. `scale` is metres per unit.
+    Limits are the joint's range, `margin` times its width wider at both ends. `scale` is metres per unit.
     """
     own = _axes(joint)
     ranges = _ranges(joint, scale)
@@ -116,7 +116,7 @@ def _axes(joint: Joint) -> list[np.ndarray]:
 
 
 def _ranges(joint: Joint, scale: float) -> list[tuple[float, float]]:
-    """The observed range of each freedom, which holds 0, where state 0 is."""
-    observed = joint.limits if joint.limits is not None and joint.values.ndim == 1 else joint.values
-    numbers = np.array([freedom_values(joint, value, scale) for value in observed] + [[0.0] * len(_TYPES[joint.type])])
+    """The range of each freedom, which holds 0, where state 0 is: `Joint.ranges`, or of several what was observed."""
+    ends = joint.ranges[0] if joint.values.ndim == 1 else joint.values
+    numbers = np.array([freedom_values(joint, value, scale) for value in ends] + [[0.0] * len(_TYPES[joint.type])])
     return list(zip(numbers.min(0).tolist(), numbers.max(0).tolist(), strict=True))

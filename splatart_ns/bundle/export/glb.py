@@ -6,6 +6,7 @@ follow), so that a program can pose the file. y is up, as glTF wants: the node a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -21,7 +22,9 @@ from splatart_ns.bundle.export.robot import Joint, Link, Robot
 
 ANIMATION = "sweep"
 _TOP = "z_up"  # the node in which z is up
-_SECONDS, _KEYS = 3.0, 24  # of each freedom's way to both limits and back
+_SECONDS, _KEYS = 3.0, 24  # of each freedom's way to both limits and back; keys at least
+_KEYS_A_RADIAN = 4  # of the farther limit: between two keys a turn is then well below half a turn, the shorter way
+_FARTHEST = 200 * np.pi  # radian, of the animation, whatever the limits are
 _FLOAT = 5126
 _UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # z to y
 
@@ -102,15 +105,18 @@ def _extras(link: Link, joint: Joint) -> dict[str, Any]:
 def sweep(robot: Robot) -> tuple[np.ndarray, list[dict[str, float]]]:
     """Times [K] in seconds, as float32 has them, and the values of all freedoms at them.
 
-    One freedom after the other goes to both its limits and back.
+    One freedom after the other goes to both its limits, or a hundred turns, and back.
     """
     leaders = [f for f in robot.freedoms if f.mimic is None]
     times, values = [0.0], [robot.complete({})]
     for n, f in enumerate(leaders):
-        low, high = f.limits
-        for k in range(1, _KEYS + 1):
-            s = np.sin(2 * np.pi * k / _KEYS)
-            times.append(_SECONDS * (n + k / _KEYS))
+        low, high, keys = *f.limits, _KEYS
+        if f.type == "revolute":
+            low, high = max(low, -_FARTHEST), min(high, _FARTHEST)
+            keys = max(keys, math.ceil(_KEYS_A_RADIAN * max(-low, high)))
+        for k in range(1, keys + 1):
+            s = np.sin(2 * np.pi * k / keys)
+            times.append(_SECONDS * (n + k / keys))
             values.append(robot.complete({f.name: max(high, 0.0) * max(s, 0.0) + min(low, 0.0) * max(-s, 0.0)}))
     return np.array(times, np.float32).astype(float), values
 

@@ -86,7 +86,9 @@ def _add_body(parent: Element, link: Link, offset: np.ndarray, joint: Joint | No
     _add_inertia(body, link.inertia)
     for freedom in joint.freedoms if joint is not None else ():
         kind = {"revolute": "hinge", "prismatic": "slide"}[freedom.type]
-        SubElement(body, "joint", name=freedom.name, type=kind, axis=_text(freedom.axis), range=_text(freedom.limits))
+        # What follows another is held by its equality alone, and that other has the limits.
+        limits = {"range": _text(freedom.limits)} if freedom.mimic is None else {}
+        SubElement(body, "joint", name=freedom.name, type=kind, axis=_text(freedom.axis), **limits)
     meshes = files[link.name]
     if meshes.surface is not None:
         attributes = {"class": "visual", "mesh": Path(meshes.surface).stem, "rgba": _text(link.colour)}

@@ -80,7 +80,7 @@ def page_object(bundle: Bundle) -> dict[str, Any]:
                 "low": slider.low,
                 "high": slider.high,
                 "step": slider.step,
-                "observed": list(slider.observed),
+                "ends": list(slider.ends),
                 "note": slider.note,
             }
             for slider in bundle_sliders(bundle)

@@ -24,6 +24,8 @@ class Run:
     """No value that is not finite, no warning of MuJoCo, no speed of an explosion."""
     excess: float
     """The most that a joint went beyond its limits, as a share of its range."""
+    strayed: float
+    """The most that a joint that follows another was from where that one puts it, radian or metre."""
     reached: float
     """The least share of its range that a joint covered while it was driven."""
     slowest: str
@@ -47,7 +49,10 @@ def simulate(path: Path) -> Run:
     limited = np.flatnonzero(model.jnt_limited)
     low, high = model.jnt_range[limited].T
     driven_low, driven_high = np.full(model.nu, np.inf), np.full(model.nu, -np.inf)
-    stable, excess = True, 0.0
+    followings = np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT)
+    followers, leaders = model.eq_obj1id[followings], model.eq_obj2id[followings]
+    factors = model.eq_data[followings, 1]
+    stable, excess, strayed = True, 0.0, 0.0
     for step in range(steps):
         data.ctrl[:] = 0.0
         turn, phase = divmod(step * model.nu / steps, 1.0) if model.nu else (0, 0.0)
@@ -63,6 +68,7 @@ def simulate(path: Path) -> Run:
             touched |= _contacts(model, data)
         q = data.qpos[limited]  # all joints are of one number
         excess = max(excess, float((np.maximum(q - high, low - q) / (high - low)).max(initial=0.0)))
+        strayed = max(strayed, float(np.abs(data.qpos[followers] - factors * data.qpos[leaders]).max(initial=0.0)))
         if model.nu:
             q = data.qpos[model.actuator_trnid[actuator, 0]]
             driven_low[actuator] = min(driven_low[actuator], q)
@@ -70,7 +76,7 @@ def simulate(path: Path) -> Run:
     stable &= not any(warning.number for warning in data.warning)
     covered = (driven_high - driven_low) / np.ptp(model.jnt_range[model.actuator_trnid[:, 0]], axis=1)
     slowest = model.actuator(int(covered.argmin())).name if model.nu else ""
-    return Run(seconds, stable, excess, float(covered.min(initial=1.0)), slowest, at_rest, touched)
+    return Run(seconds, stable, excess, strayed, float(covered.min(initial=1.0)), slowest, at_rest, touched)
 
 
 def _across(phase: float, low: float, high: float) -> float:

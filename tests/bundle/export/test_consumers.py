@@ -154,6 +154,39 @@ def test_a_wrong_file_fails(objects, tmp_path, form):
     assert any(c.verdict == "failed" for c in checks), report(checks)
 
 
+def test_an_object_too_small_for_mujocos_urdf_reader_is_said_to_be(objects, tmp_path):
+    pytest.importorskip("mujoco")
+    bundle = objects.chain(["revolute"])
+    robot = objects.robot(bundle, scale=1e-5)
+    checks = report(validate(export(bundle, robot, "urdf", tmp_path / "urdf"), "urdf", bundle, robot))
+    verdict, found = checks["mujoco", "link poses"]
+    assert verdict == "failed"
+    assert "too small for MuJoCo's URDF reader; give a larger --scale, or --format mjcf" in found
+    assert_good(validate(export(bundle, robot, "mjcf", tmp_path / "mjcf"), "mjcf", bundle, robot))
+
+
+@pytest.mark.parametrize("turns", [3, 1000])
+def test_an_animation_goes_the_long_way_of_many_turns(objects, tmp_path, turns):
+    bundle = objects.chain(["screw", "revolute"])
+    bundle.joints[0].limits = (0.0, turns * 2 * np.pi)
+    robot = objects.robot(bundle)
+    path = export(bundle, robot, "glb", tmp_path / "out")
+    assert_good(validate(path, "glb", bundle, robot))
+    assert path.stat().st_size < 1e6
+
+
+def test_a_screw_of_fine_pitch_passes_as_long_as_its_slide_follows_its_turn(objects, tmp_path):
+    pytest.importorskip("mujoco")
+    bundle = objects.chain(["screw"])
+    bundle.joints[0].pitch = 1e-4
+    robot = objects.robot(bundle)
+    path = export(bundle, robot, "mjcf", tmp_path / "out")
+    assert_good(validate(path, "mjcf", bundle, robot))
+    path.write_text(path.read_text().replace('solref="0.005 1"', 'solref="1 1"'))  # loose
+    (found,) = [c for c in validate(path, "mjcf", bundle, robot) if c.verdict == "failed"]
+    assert "beyond limits by 0.0%" in found.found and "what follows others strayed by" in found.found
+
+
 @pytest.mark.parametrize("form", ["urdf", "mjcf", "usd", "glb", "ply"])
 def test_a_damaged_file_fails_without_a_traceback(objects, tmp_path, form):
     bundle = objects.chain(["revolute"])

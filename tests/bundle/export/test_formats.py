@@ -2,7 +2,10 @@
 
 import importlib.util
 import json
+import re
+import subprocess
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -56,6 +59,16 @@ def test_mesh_files_are_beside_the_description_and_in_the_links_frame(objects, w
     names = [p.relative_to(path.parent).as_posix() for p in path.parent.rglob("*.obj")]
     listed = json.loads((path.parent / "export.json").read_text())["files"]
     assert set(names) | {path.name} == set(listed)
+
+
+def test_the_sed_line_of_the_docs_makes_mesh_paths_of_a_ros_package(write):
+    path = write("urdf")
+    docs = (Path(__file__).parents[3] / "docs/export.md").read_text()
+    expression = re.search(r"sed -i '(.*)' \*\.urdf", docs)[1]
+    found = subprocess.run(["sed", expression, path], capture_output=True, text=True, check=True).stdout
+    files = [mesh.get("filename") for mesh in ElementTree.fromstring(found.encode()).iter("mesh")]
+    assert files and all((path.parent / file.removeprefix("package://NAME/")).is_file() for file in files)
+    assert all(file.startswith("package://NAME/meshes/") for file in files)
 
 
 def test_an_mjcf_keeps_neighbours_from_colliding_and_drives_what_has_a_value_of_its_own(write):

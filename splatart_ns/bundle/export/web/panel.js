@@ -23,7 +23,7 @@ class Panel {
     addSlider(slider, moved) {
         const limits = {min: slider.low, max: slider.high, step: slider.step, value: 0};
         const marks = element("datalist", {id: `marks-${get("sliders").childElementCount}`});
-        for (const value of slider.observed) marks.append(element("option", {value}));
+        for (const value of slider.ends) marks.append(element("option", {value}));
         const range = element("input", {type: "range", ...limits}), number = element("input", {type: "number", ...limits});
         range.setAttribute("list", marks.id);
         for (const input of [range, number]) {

@@ -1,5 +1,5 @@
 "use strict";
-// The sweep: one joint after the other over what was observed, there and back, as in splatart_ns/bundle/configurations.py.
+// The sweep: one joint after the other over its range, there and back, as in splatart_ns/bundle/configurations.py.
 
 const SWEEP_SECONDS = 4;  // of a joint
 

@@ -12,7 +12,7 @@ function fillTable(object) {
             element("td", {}, parent.name),
             element("td", {}, child.name),
             element("td", {}, hasAxis(joint) ? joint.axis.map(x => withMinus(x.toFixed(3))).join(", ") : "–"),
-            element("td", {}, observed(joint)),
+            element("td", {}, range(joint)),
             element("td", {className: joint.ambiguous ? "warning" : ""}, joint.ambiguous ? doubt(joint, object) : "no"),
             element("td", {}, uncertainty(joint)));
     });
@@ -28,10 +28,10 @@ function doubt(joint, object) {
     return ["yes", ...joint.other_parents.map(part => `may hang on ${object.parts[part].name}`)].join(", ");
 }
 
-/** What was observed, for each freedom. */
-function observed(joint) {
+/** Its range, for each freedom. */
+function range(joint) {
     return joint.freedoms.map(({name, unit}, i) => {
-        const range = joint.limits ?? joint.values.map(value => value[i]), values = range.map(x => x * perUnit(unit));
+        const ends = joint.limits ?? joint.values.map(value => value[i]), values = ends.map(x => x * perUnit(unit));
         return `${name} ${digits(Math.min(...values))} to ${digits(Math.max(...values))} ${unit}`.trim();
     }).join("; ") || "–";
 }
