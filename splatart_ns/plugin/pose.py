@@ -163,6 +163,11 @@ class PosePipeline(VanillaPipeline):
             return
         capture = self.datamanager.capture
         runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
+        if len(runs) != len(capture.states):
+            raise InputError(
+                f"--pipeline.semantic-runs names {len(runs)} of the runs of {capture.path}, which has "
+                f"{len(capture.states)} states; name one of each, in their order."
+            )
         what = (self.model.num_parts, device, self.datamanager.train_dataset.downscale)
         states = [read_state(capture, s, run, *what) for s, run in enumerate(runs)]
         self.views = [state.views for state in states]

@@ -14,6 +14,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from splatart_ns.capture.capture import State
+from splatart_ns.capture.digest import training_digest
 from splatart_ns.capture.seen_surface import LEAST_CONFIRMED
 from splatart_ns.capture.view import View
 from splatart_ns.capture.worlds import OTHER_WORLDS_MEND, looks_elsewhere
@@ -116,6 +117,8 @@ class SemanticModel(SplatartModel):
         self.register_buffer("gains", torch.ones(self.num_train_data, 3))
         # Whether they have labels that do not contradict the others'.
         self.register_buffer("trusted", torch.zeros(self.num_train_data, dtype=torch.bool))
+        # The `training_digest` of its state.
+        self.register_buffer("trained_on", torch.zeros(32, dtype=torch.uint8))
 
     def load_state_dict(self, state, **kwargs):
         for name in ("viewmats", "gains", "trusted"):
@@ -238,6 +241,8 @@ class SemanticPipeline(VanillaPipeline):
             self._views = list(dataset.views)
             self._given = torch.stack([view.viewmat for view in self._views]).double()
             self.model.viewmats = self._given.to(self.device)
+            digest = training_digest(self.datamanager.capture, self.datamanager.dataparser.config.state)
+            self.model.trained_on = torch.tensor(list(digest), dtype=torch.uint8, device=self.device)
 
     @property
     def _state(self) -> State:
