@@ -9,7 +9,7 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
@@ -21,6 +21,7 @@ from splatart_ns.capture.worlds import OTHER_WORLDS_MEND, looks_elsewhere
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
+from splatart_ns.plugin.pipeline import StagePipeline
 from splatart_ns.rasterize.ssim import l1_ssim_loss
 from splatart_ns.stages.camera_refinement import PASSES, camera_change, refine_cameras
 from splatart_ns.stages.exposure import at_gain, frame_gains, unevenness
@@ -216,7 +217,7 @@ class SemanticPipelineConfig(VanillaPipelineConfig):
     _target: type = field(default_factory=lambda: SemanticPipeline)
 
 
-class SemanticPipeline(VanillaPipeline):
+class SemanticPipeline(StagePipeline):
     """Lets the second phase see labelled frames only, and starts it from votes."""
 
     def __init__(self, *args, **kwargs):
