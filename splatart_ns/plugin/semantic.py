@@ -199,10 +199,7 @@ class SemanticModel(SplatartModel):
             wrong = depth_loss(outputs["depth"][..., 0], outputs["accumulation"][..., 0], seen)
             losses["depth"] = self.config.depth_weight * wrong
         # Beside the piece that shows the object nothing is wrong: the means are those over the whole image.
-        losses = {name: batch.get("share", 1.0) * loss for name, loss in losses.items()}
-        if self.training:
-            self.camera_optimizer.get_loss_dict(losses)
-        return losses
+        return {name: batch.get("share", 1.0) * loss for name, loss in losses.items()}
 
     def _downscale_labels(self, labels: Tensor) -> Tensor:
         """Every d-th label, or depth: they must not mix."""
