@@ -54,6 +54,11 @@ class SplatartModel(SplatfactoModel):
                 f"--pipeline.model.camera-optimizer.mode is {mode}, but later stages do not read what it finds; leave "
                 "it off, and refine cameras by --pipeline.model.refine-cameras on of splatart-semantic."
             )
+        if self.config.use_bilateral_grid:
+            raise InputError(
+                "--pipeline.model.use-bilateral-grid is True, but there is none in SPLATART's models; leave it out: "
+                "splatart-semantic brings frames to one exposure without it."
+            )
         if self.config.rasterizer != "auto":
             set_backend(self.config.rasterizer)
             if self.config.rasterizer == "numba" and torch.device(self.kwargs.get("device", "cpu")).type != "cpu":
