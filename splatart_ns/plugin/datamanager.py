@@ -15,6 +15,8 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from splatart_ns.capture.capture import UNLABELLED, Capture
 from splatart_ns.capture.seen_surface import SeenSurface, measured_surface
 from splatart_ns.capture.view import View, Window, load_points, load_view
+from splatart_ns.errors import InputError
+from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.stages.hull import EXACT, SeedPoints, seed_points, seen_surface, slack, visual_hull
 from splatart_ns.stages.silhouette import with_silhouette
 from splatart_ns.stages.surroundings import surrounding_points
@@ -83,6 +85,11 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
     config: SplatartDatamanagerConfig
 
     def __init__(self, config: SplatartDatamanagerConfig, *args, test_mode: str = "val", **kwargs):
+        if not isinstance(config.dataparser, SplatartDataParserConfig):
+            raise InputError(
+                f"The data parser is {type(config.dataparser).__name__}, which tells no states and parts; leave it out "
+                "of the command, or name splatart-capture, which reads nerfstudio's transforms.json too."
+            )
         super().__init__(config, *args, test_mode=test_mode, **kwargs)
         self.slack = EXACT
         """By how much the silhouettes contradict each other."""

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.colormaps import apply_colormap
 
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.view import View
+from splatart_ns.errors import InputError
 from splatart_ns.plugin.datamanager import SplatartDatamanager, SplatartDatamanagerConfig
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.stages.hull import carve
@@ -39,6 +41,12 @@ def test_batches_have_alpha_and_labels_and_frames_without_labels_say_so(capture_
             assert (image[..., 3:][labels > 0] > 0).float().mean() > 0.95
     assert labelled == {i for i, frame in enumerate(frames) if frame.labels is not None}
     assert 0 < len(labelled) < len(frames)
+
+
+def test_other_data_parsers_are_refused(capture_dir: Path) -> None:
+    config = SplatartDatamanagerConfig(dataparser=NerfstudioDataParserConfig(data=capture_dir / "state_00"))
+    with pytest.raises(InputError, match="is NerfstudioDataParserConfig, .* splatart-capture"):
+        config.setup(device="cpu")
 
 
 def test_images_to_show_are_over_white_as_renders_are(capture_dir: Path, opaque_capture_dir: Path) -> None:
