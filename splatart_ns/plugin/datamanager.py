@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
 from splatart_ns.capture.capture import UNLABELLED, Capture
@@ -21,16 +22,29 @@ from splatart_ns.stages.hull import EXACT, SeedPoints, seed_points, seen_surface
 from splatart_ns.stages.silhouette import with_silhouette
 from splatart_ns.stages.surroundings import surrounding_points
 
+NEARLY = 0.005
+"""A scale factor is 1 / n if its n-fold is so near 1: 0.333 is 1 / 3."""
+LEAST_SCALE = 0.001
+
 
 class CaptureDataset(InputDataset):
     """Frames of one state. Frames may lack labels: their `semantics` are all 255."""
 
     exclude_batch_keys_from_device = [*InputDataset.exclude_batch_keys_from_device, "semantics"]
 
-    @property
-    def downscale(self) -> int:
+    def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0):
+        """Raises `InputError` unless the scale factor is nearly 1 / n."""
+        self.downscale = round(1 / scale_factor) if LEAST_SCALE <= scale_factor <= 1 else 0
         """How many times smaller than the files images are looked at."""
-        return round(1 / self.scale_factor)
+        if not abs(self.downscale * scale_factor - 1) <= NEARLY:
+            raise InputError(
+                f"--pipeline.datamanager.camera-res-scale-factor is {scale_factor}; give 1 / n with a whole n, as 1, "
+                f"0.5, 0.333 or 0.25, and at least {LEAST_SCALE}."
+            )
+        super().__init__(dataparser_outputs, 1 / self.downscale)
+        # As the images are; nerfstudio's may be a pixel smaller, by rounding.
+        given = dataparser_outputs.cameras
+        self.cameras.width, self.cameras.height = given.width // self.downscale, given.height // self.downscale
 
     def get_view(self, image_idx: int) -> View:
         """One frame's pixels, undistorted."""

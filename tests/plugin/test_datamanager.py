@@ -1,4 +1,5 @@
 import json
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -47,6 +48,23 @@ def test_other_data_parsers_are_refused(capture_dir: Path) -> None:
     config = SplatartDatamanagerConfig(dataparser=NerfstudioDataParserConfig(data=capture_dir / "state_00"))
     with pytest.raises(InputError, match="is NerfstudioDataParserConfig, .* splatart-capture"):
         config.setup(device="cpu")
+
+
+@pytest.mark.parametrize("factor", [0.4, 2.0, 0.66, 0.33, 0.0, -0.5, 1e-9, math.inf, math.nan])
+def test_images_that_would_not_be_a_whole_number_of_times_smaller_are_refused(capture_dir: Path, factor: float) -> None:
+    with pytest.raises(InputError, match=f"camera-res-scale-factor is {factor}; give 1 / n"):
+        manage(capture_dir, camera_res_scale_factor=factor)
+
+
+@pytest.mark.parametrize(("factor", "side"), [(1.0, 64), (0.5, 32), (0.25, 16), (0.333, 21), (0.1667, 10), (1 / 60, 1)])
+def test_cameras_are_as_large_as_images_that_are_made_smaller(capture_dir: Path, factor: float, side: int) -> None:
+    manager = manage(capture_dir, camera_res_scale_factor=factor)
+    camera, batch = manager.next_train(0)
+    assert batch["image"].shape == (side, side, 4) and camera.metadata["whole"] == (side, side)
+    view = manager.train_dataset.views[batch["image_idx"]]
+    K, (left, top, *_) = view.K, view.object_window()
+    expected = torch.tensor([K[0, 0], K[1, 1], K[0, 2] - left, K[1, 2] - top])
+    assert torch.allclose(torch.cat([camera.fx, camera.fy, camera.cx, camera.cy], -1), expected)
 
 
 def test_images_to_show_are_over_white_as_renders_are(capture_dir: Path, opaque_capture_dir: Path) -> None:
