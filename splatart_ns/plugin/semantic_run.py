@@ -97,7 +97,8 @@ def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
         if state not in found:
             raise InputError(
                 f"outputs/ holds no finished splatart-semantic run of state {state} of {capture}; run "
-                f"`ns-train splatart-semantic --data {capture} splatart-capture --state {state}` first."
+                f"`ns-train splatart-semantic --data {capture} splatart-capture --state {state}` first, or name the "
+                "config.yml of every state's run by --pipeline.semantic-runs."
             )
     return tuple(found[s] for s in range(num_states))
 

@@ -11,7 +11,7 @@ from splatart_ns.plugin.semantic_run import find_semantic_runs, learned_views
 
 def test_semantic_runs_that_are_not_there_are_named_by_state(capture_dir, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="--state 0"):
+    with pytest.raises(InputError, match="--state 0` first, or name .* by --pipeline.semantic-runs"):
         find_semantic_runs(capture_dir, 2)
 
 
