@@ -11,7 +11,7 @@ from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.plugin.joint import JointModelConfig, JointPipelineConfig, JointTrainerConfig
 
 # Nothing learns in this method, but nerfstudio wants an optimizer for every group of parameters.
-GROUPS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest", "semantics", "camera_opt")
+GROUPS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest", "semantics")
 
 method = MethodSpecification(
     config=JointTrainerConfig(

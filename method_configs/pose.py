@@ -46,7 +46,6 @@ method = MethodSpecification(
             "features_dc": _adam(3.4e-2),
             "features_rest": _adam(3.4e-3),
             "semantics": _adam(7e-2),
-            "camera_opt": _adam(1e-4),
         },
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),

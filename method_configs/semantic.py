@@ -54,7 +54,6 @@ method = MethodSpecification(
             "features_dc": _adam(1.5e-2),
             "features_rest": _adam(1e-3),
             "semantics": _adam(5e-2),
-            "camera_opt": _adam(1e-4, 0.1),
         },
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-from splatart_ns.capture.capture import Capture, State
+from splatart_ns.capture.capture import Capture, Frame, State
 
 
 def capture_digest(capture: Capture, states: Sequence[State] | None = None) -> str:
@@ -16,6 +16,27 @@ def capture_digest(capture: Capture, states: Sequence[State] | None = None) -> s
         for frame in state.frames:
             digest.update(repr((frame.name, frame.camera, frame.T_world_camera.tolist(), frame.split)).encode())
             digest.update(repr(frame.depth_unit).encode() if frame.depth else b"")
-            for file in (frame.image, frame.labels, frame.object_mask, frame.mask, frame.depth):
-                digest.update(file.read_bytes() if file else b"-")
+            for content in _contents(frame):
+                digest.update(content)
     return digest.hexdigest()
+
+
+def training_digest(capture: Capture, state: int) -> bytes:
+    """SHA-256 of the training frames of a state: their files, and their cameras in the normalised world.
+
+    What was computed counts to 6 digits: machines may round the rest otherwise.
+    """
+    digest, normalization = hashlib.sha256(), capture.normalization
+    for frame in capture.states[state].split("train"):
+        pose = normalization.camera_to_normal(frame.T_world_camera).round(6) + 0.0  # no -0
+        depth_unit = f"{normalization.scale * frame.depth_unit:.6g}"
+        digest.update(repr((frame.name, frame.camera, pose.tolist(), depth_unit)).encode())
+        for content in _contents(frame):
+            digest.update(content)
+    return digest.digest()
+
+
+def _contents(frame: Frame) -> Iterator[bytes]:
+    """Of all files of a frame."""
+    for file in (frame.image, frame.labels, frame.object_mask, frame.mask, frame.depth):
+        yield file.read_bytes() if file else b"-"

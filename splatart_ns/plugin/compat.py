@@ -134,11 +134,26 @@ def _has_sizes(tensor: torch.Tensor, shape: Sequence[int | str], sizes: dict[str
 
 
 def finished_runs(capture: Path, method: str) -> list[Path]:
-    """The config.yml of every run of a method on a capture under outputs/ that left a checkpoint, oldest first."""
+    """The config.yml of every run of a method on a capture under outputs/ that took all its steps, oldest first."""
     configs = Path("outputs").glob(f"*/{method}/*/config.yml")
-    finished = [c for c in configs if any((c.parent / "nerfstudio_models").glob("step-*.ckpt"))]
-    on_capture = [c for c in finished if _data_of(c) == os.path.realpath(capture)]
-    return sorted(on_capture, key=lambda config: config.stat().st_mtime)
+    saved = [c for c in configs if _saved_steps(c) > 0]
+    on_capture = [c for c in saved if _data_of(c) == os.path.realpath(capture)]
+    finished = [c for c in on_capture if _saved_steps(c) >= _steps_of(c)]
+    return sorted(finished, key=lambda config: config.stat().st_mtime)
+
+
+def _saved_steps(config: Path) -> int:
+    """How many steps a run had taken at its newest checkpoint; 0 if it has left none."""
+    numbers = (file.stem.removeprefix("step-") for file in config.parent.glob("nerfstudio_models/step-*.ckpt"))
+    return max((int(number) + 1 for number in numbers if number.isdecimal()), default=0)
+
+
+def _steps_of(config: Path) -> int:
+    """How many steps a run was to take."""
+    steps = run_setting(config, "max_num_iterations")
+    if not isinstance(steps, int):
+        raise InputError(f"{config} does not say how many steps its run was to take; train that stage again.")
+    return steps
 
 
 def _data_of(config: Path) -> str:

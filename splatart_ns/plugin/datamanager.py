@@ -10,14 +10,21 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
 from splatart_ns.capture.capture import UNLABELLED, Capture
 from splatart_ns.capture.seen_surface import SeenSurface, measured_surface
 from splatart_ns.capture.view import View, Window, load_points, load_view
+from splatart_ns.errors import InputError
+from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.stages.hull import EXACT, SeedPoints, seed_points, seen_surface, slack, visual_hull
 from splatart_ns.stages.silhouette import with_silhouette
 from splatart_ns.stages.surroundings import surrounding_points
+
+NEARLY = 0.005
+"""A scale factor is 1 / n if its n-fold is so near 1: 0.333 is 1 / 3."""
+LEAST_SCALE = 0.001
 
 
 class CaptureDataset(InputDataset):
@@ -25,10 +32,19 @@ class CaptureDataset(InputDataset):
 
     exclude_batch_keys_from_device = [*InputDataset.exclude_batch_keys_from_device, "semantics"]
 
-    @property
-    def downscale(self) -> int:
+    def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0):
+        """Raises `InputError` unless the scale factor is nearly 1 / n."""
+        self.downscale = round(1 / scale_factor) if LEAST_SCALE <= scale_factor <= 1 else 0
         """How many times smaller than the files images are looked at."""
-        return round(1 / self.scale_factor)
+        if not abs(self.downscale * scale_factor - 1) <= NEARLY:
+            raise InputError(
+                f"--pipeline.datamanager.camera-res-scale-factor is {scale_factor}; give 1 / n with a whole n, as 1, "
+                f"0.5, 0.333 or 0.25, and at least {LEAST_SCALE}."
+            )
+        super().__init__(dataparser_outputs, 1 / self.downscale)
+        # As the images are; nerfstudio's may be a pixel smaller, by rounding.
+        given = dataparser_outputs.cameras
+        self.cameras.width, self.cameras.height = given.width // self.downscale, given.height // self.downscale
 
     def get_view(self, image_idx: int) -> View:
         """One frame's pixels, undistorted."""
@@ -83,6 +99,11 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
     config: SplatartDatamanagerConfig
 
     def __init__(self, config: SplatartDatamanagerConfig, *args, test_mode: str = "val", **kwargs):
+        if not isinstance(config.dataparser, SplatartDataParserConfig):
+            raise InputError(
+                f"The data parser is {type(config.dataparser).__name__}, which tells no states and parts; leave it out "
+                "of the command, or name splatart-capture, which reads nerfstudio's transforms.json too."
+            )
         super().__init__(config, *args, test_mode=test_mode, **kwargs)
         self.slack = EXACT
         """By how much the silhouettes contradict each other."""

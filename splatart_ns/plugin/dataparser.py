@@ -83,6 +83,7 @@ class SplatartDataParser(DataParser):
                 width=column("width"),
                 height=column("height"),
                 camera_type=CameraType.PERSPECTIVE,
+                metadata={},  # `ns-export cameras` wants to add to it
             ),
             scene_box=SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3])),
             metadata={

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerSlider
 from torch import Tensor, nn
@@ -29,6 +29,7 @@ from splatart_ns.geometry.se3 import se3_exp, se3_log
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint
 from splatart_ns.plugin.gaussians import SPLAT_SHAPES, gauss_params_from_splat, splat_from_state
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
+from splatart_ns.plugin.pipeline import StagePipeline
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics, shifted
 from splatart_ns.stages.joint_constraint import parse_constraints
@@ -201,7 +202,7 @@ class JointPipelineConfig(VanillaPipelineConfig):
     """Noted in the bundle."""
 
 
-class JointPipeline(VanillaPipeline):
+class JointPipeline(StagePipeline):
     """Fits joints and tree to the poses of a splatart-pose run."""
 
     config: JointPipelineConfig

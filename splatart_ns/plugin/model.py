@@ -49,6 +49,16 @@ class SplatartModel(SplatfactoModel):
 
     def populate_modules(self) -> None:
         """Gaussians from seed points or at random, strategy and metrics; nothing is downloaded."""
+        if (mode := self.config.camera_optimizer.mode) != "off":
+            raise InputError(
+                f"--pipeline.model.camera-optimizer.mode is {mode}, but later stages do not read what it finds; leave "
+                "it off, and refine cameras by --pipeline.model.refine-cameras on of splatart-semantic."
+            )
+        if self.config.use_bilateral_grid:
+            raise InputError(
+                "--pipeline.model.use-bilateral-grid is True, but there is none in SPLATART's models; leave it out: "
+                "splatart-semantic brings frames to one exposure without it."
+            )
         if self.config.rasterizer != "auto":
             set_backend(self.config.rasterizer)
             if self.config.rasterizer == "numba" and torch.device(self.kwargs.get("device", "cpu")).type != "cpu":
@@ -66,6 +76,7 @@ class SplatartModel(SplatfactoModel):
                 self.config.num_random, self.config.random_scale, self.config.sh_degree, self.num_parts
             )
         self.gauss_params = nn.ParameterDict(gauss_params_from_splat(splat))
+        # Off; Splatfacto asks it for its parameters.
         self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.register_buffer("palette", part_colours(self.num_parts), persistent=False)
         self.step = 0
@@ -94,9 +105,6 @@ class SplatartModel(SplatfactoModel):
 
     def rasterize(self, splat: Splat, camera: Cameras, *, parts: bool, depth: bool) -> Rendering:
         """Render a splat from one nerfstudio camera, at the training resolution of this step."""
-        poses = camera.camera_to_worlds
-        if self.training:
-            poses = self.camera_optimizer.apply_to_camera(camera)
         factor = self._get_downscale_factor()
         camera.rescale_output_resolution(1 / factor)
         K = camera.get_intrinsics_matrices().to(self.device)
@@ -104,7 +112,7 @@ class SplatartModel(SplatfactoModel):
         camera.rescale_output_resolution(factor)
         return render(
             splat,
-            viewmat_from_opengl(poses.to(self.device)),
+            viewmat_from_opengl(camera.camera_to_worlds.to(self.device)),
             K,
             width,
             height,
@@ -150,9 +158,7 @@ class SplatartModel(SplatfactoModel):
             return {"gaussian_count": self.num_points}
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
         mse = batch.get("share", 1.0) * (outputs["rgb"].detach() - target).square().mean()
-        metrics = {"psnr": -10 * mse.clamp_min(1e-10).log10(), "gaussian_count": self.num_points}
-        self.camera_optimizer.get_metrics_dict(metrics)
-        return metrics
+        return {"psnr": -10 * mse.clamp_min(1e-10).log10(), "gaussian_count": self.num_points}
 
     def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
         """PSNR, SSIM, LPIPS (when asked for) and part IoU of one evaluation image, and pictures to look at."""

@@ -16,7 +16,7 @@ import torch
 from gsplat.strategy.ops import remove
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
-from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
@@ -27,6 +27,7 @@ from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import inverse, so3_log
 from splatart_ns.plugin.gaussians import gauss_params_from_splat
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
+from splatart_ns.plugin.pipeline import StagePipeline
 from splatart_ns.plugin.semantic_run import find_semantic_runs, read_state
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
@@ -150,7 +151,7 @@ class PosePipelineConfig(VanillaPipelineConfig):
     """Seed of the registration and of the order of views."""
 
 
-class PosePipeline(VanillaPipeline):
+class PosePipeline(StagePipeline):
     """Estimates T[state][part] over all states of a capture, then merges and polishes the parts' Gaussians."""
 
     config: PosePipelineConfig
@@ -163,6 +164,11 @@ class PosePipeline(VanillaPipeline):
             return
         capture = self.datamanager.capture
         runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
+        if len(runs) != len(capture.states):
+            raise InputError(
+                f"--pipeline.semantic-runs names {len(runs)} of the runs of {capture.path}, which has "
+                f"{len(capture.states)} states; name one of each, in their order."
+            )
         what = (self.model.num_parts, device, self.datamanager.train_dataset.downscale)
         states = [read_state(capture, s, run, *what) for s, run in enumerate(runs)]
         self.views = [state.views for state in states]
@@ -455,7 +461,7 @@ class PosePipeline(VanillaPipeline):
         """One of the rounds in which merged Gaussians go that the images hardly miss."""
         start, model = time.perf_counter(), self.model
         absence, error = self._absence(turn)
-        if "thinned" not in self.findings:  # the first round, or the first after a run was resumed
+        if turn == 0:
             self._error = error
             self.findings["thinned"] = {"gaussians": [model.num_points] * 2, "added_error": 0.0, "seconds": 0.0}
         told = self.findings["thinned"]

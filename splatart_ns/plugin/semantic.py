@@ -9,17 +9,19 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from splatart_ns.capture.capture import State
+from splatart_ns.capture.digest import training_digest
 from splatart_ns.capture.seen_surface import LEAST_CONFIRMED
 from splatart_ns.capture.view import View
 from splatart_ns.capture.worlds import OTHER_WORLDS_MEND, looks_elsewhere
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
+from splatart_ns.plugin.pipeline import StagePipeline
 from splatart_ns.rasterize.ssim import l1_ssim_loss
 from splatart_ns.stages.camera_refinement import PASSES, camera_change, refine_cameras
 from splatart_ns.stages.exposure import at_gain, frame_gains, unevenness
@@ -116,6 +118,8 @@ class SemanticModel(SplatartModel):
         self.register_buffer("gains", torch.ones(self.num_train_data, 3))
         # Whether they have labels that do not contradict the others'.
         self.register_buffer("trusted", torch.zeros(self.num_train_data, dtype=torch.bool))
+        # The `training_digest` of its state.
+        self.register_buffer("trained_on", torch.zeros(32, dtype=torch.uint8))
 
     def load_state_dict(self, state, **kwargs):
         for name in ("viewmats", "gains", "trusted"):
@@ -195,10 +199,7 @@ class SemanticModel(SplatartModel):
             wrong = depth_loss(outputs["depth"][..., 0], outputs["accumulation"][..., 0], seen)
             losses["depth"] = self.config.depth_weight * wrong
         # Beside the piece that shows the object nothing is wrong: the means are those over the whole image.
-        losses = {name: batch.get("share", 1.0) * loss for name, loss in losses.items()}
-        if self.training:
-            self.camera_optimizer.get_loss_dict(losses)
-        return losses
+        return {name: batch.get("share", 1.0) * loss for name, loss in losses.items()}
 
     def _downscale_labels(self, labels: Tensor) -> Tensor:
         """Every d-th label, or depth: they must not mix."""
@@ -213,7 +214,7 @@ class SemanticPipelineConfig(VanillaPipelineConfig):
     _target: type = field(default_factory=lambda: SemanticPipeline)
 
 
-class SemanticPipeline(VanillaPipeline):
+class SemanticPipeline(StagePipeline):
     """Lets the second phase see labelled frames only, and starts it from votes."""
 
     def __init__(self, *args, **kwargs):
@@ -238,6 +239,8 @@ class SemanticPipeline(VanillaPipeline):
             self._views = list(dataset.views)
             self._given = torch.stack([view.viewmat for view in self._views]).double()
             self.model.viewmats = self._given.to(self.device)
+            digest = training_digest(self.datamanager.capture, self.datamanager.dataparser.config.state)
+            self.model.trained_on = torch.tensor(list(digest), dtype=torch.uint8, device=self.device)
 
     @property
     def _state(self) -> State:

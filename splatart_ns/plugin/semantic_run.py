@@ -8,6 +8,7 @@ from pathlib import Path
 from torch import Tensor
 
 from splatart_ns.capture.capture import Capture
+from splatart_ns.capture.digest import training_digest
 from splatart_ns.capture.seen_surface import measured_surface
 from splatart_ns.capture.view import View, load_views
 from splatart_ns.errors import InputError
@@ -18,7 +19,7 @@ from splatart_ns.stages.exposure import at_gain
 from splatart_ns.stages.silhouette import rendered_silhouette, with_rendered_labels, with_silhouette
 
 _SHAPES = {
-    "_model.cameras_refined": (),
+    **{"_model.cameras_refined": (), "_model.trained_on": (32,)},
     **{"_model.viewmats": ("views", 4, 4), "_model.gains": ("views", 3), "_model.trusted": ("views",)},
 }
 
@@ -42,9 +43,10 @@ def read_state(
     """What a run, given by its config.yml, made of a state; views are `downscale` times smaller than the images.
 
     Raises:
-        InputError: the run is not of this capture, or learned no parts.
+        InputError: the run is not of this state of the capture as it is now, or learned no parts.
     """
     checkpoint = read_checkpoint(run, SPLAT_SHAPES | _SHAPES)
+    _require_trained_on(capture, state, run, checkpoint["_model.trained_on"].tolist())
     splat = splat_from_state(checkpoint).to(device)
     if splat.part_logits.shape[1] != num_parts + 1:
         raise InputError(
@@ -63,6 +65,23 @@ def read_state(
     return LabelledState(splat, views, labelled, bool(checkpoint["_model.cameras_refined"]))
 
 
+def _require_trained_on(capture: Capture, state: int, run: Path, digest: list[int]) -> None:
+    """Raises `InputError` if a run's `training_digest` is not that of the state."""
+    if digest == list(training_digest(capture, state)):
+        return
+    name = capture.states[state].name
+    for k, other in enumerate(capture.states):
+        if digest == list(training_digest(capture, k)):
+            raise InputError(
+                f"{run} is given for {name} and was trained on {other.name}; give --pipeline.semantic-runs one run of "
+                "each state, in the order of the states."
+            )
+    raise InputError(
+        f"{run} was trained on other frames, cameras or --worlds than {name} of {capture.path} has; run "
+        f"`ns-train splatart-semantic --data {capture.path} splatart-capture --state {state}` again."
+    )
+
+
 def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
     """The config.yml of the latest finished splatart-semantic run of each state under outputs/.
 
@@ -78,7 +97,8 @@ def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
         if state not in found:
             raise InputError(
                 f"outputs/ holds no finished splatart-semantic run of state {state} of {capture}; run "
-                f"`ns-train splatart-semantic --data {capture} splatart-capture --state {state}` first."
+                f"`ns-train splatart-semantic --data {capture} splatart-capture --state {state}` first, or name the "
+                "config.yml of every state's run by --pipeline.semantic-runs."
             )
     return tuple(found[s] for s in range(num_states))
 
@@ -87,12 +107,7 @@ def learned_views(capture: Capture, state: int, checkpoint: dict[str, Tensor], d
     """The training views of a state as its splatart-semantic run saw them in the end: with the cameras that it refined,
     at one exposure, and without the labels and the depth that it did not trust."""
     views = load_views(capture, state, "train", downscale)
-    learned = [checkpoint.get(f"_model.{name}", ()) for name in ("viewmats", "gains", "trusted")]
-    if any(len(values) != len(views) for values in learned):
-        raise InputError(
-            f"{capture.path}: the splatart-semantic run of {capture.states[state].name} is of other training frames "
-            "than the capture's or of an earlier version; train it again."
-        )
+    learned = [checkpoint[f"_model.{name}"] for name in ("viewmats", "gains", "trusted")]
     views = [
         replace(view, viewmat=viewmat.float(), rgb=at_gain(view.rgb, gain), labels=view.labels if trusted else None)
         for view, viewmat, gain, trusted in zip(views, *learned, strict=True)

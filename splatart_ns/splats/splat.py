@@ -101,9 +101,12 @@ class Splat:
 
     @staticmethod
     def cat(splats: Sequence[Splat]) -> Splat:
-        """All Gaussians of several splats with the same SH degree and parts."""
+        """All Gaussians of several splats with the same parts, at the highest of their SH degrees."""
         values = {}
         for f in fields(Splat):
             tensors = [getattr(s, f.name) for s in splats]
+            if f.name == "sh":
+                count = max(sh.shape[1] for sh in tensors)
+                tensors = [sh if sh.shape[1] == count else F.pad(sh, (0, 0, 0, count - sh.shape[1])) for sh in tensors]
             values[f.name] = None if any(t is None for t in tensors) else torch.cat(tensors)
         return Splat(**values)

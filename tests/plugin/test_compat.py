@@ -13,18 +13,19 @@ from splatart_ns.errors import InputError
 from splatart_ns.plugin.compat import StartView, finished_runs, read_checkpoint, read_run_config
 
 
-def write_run(folder: Path, data: Path, *, finished: bool = True) -> Path:
-    """A run's folder with as much of a config.yml as matters."""
+def write_run(folder: Path, data: Path, *, saved_at: int | None = 9) -> Path:
+    """A run's folder with as much of a config.yml as matters, of ten steps, and a checkpoint of one of them."""
     parts = "".join(f"\n      - {part}" for part in data.parts)
     (folder / "nerfstudio_models").mkdir(parents=True)
     (folder / "config.yml").write_text(
         "!!python/object:splatart_ns.plugin.joint.JointTrainerConfig\n"
+        "max_num_iterations: 10\n"
         "pipeline: !!python/object:a.B\n  datamanager: !!python/object:c.D\n"
         f"    data: &id001 !!python/object/apply:pathlib.PosixPath{parts}\n"
         "    dataparser: !!python/object:e.F\n      data: *id001\n      state: 1\n"
     )
-    if finished:
-        torch.save({"pipeline": {}}, folder / "nerfstudio_models" / "step-000000009.ckpt")
+    if saved_at is not None:
+        torch.save({"pipeline": {}}, folder / "nerfstudio_models" / f"step-{saved_at:09d}.ckpt")
     return folder / "config.yml"
 
 
@@ -53,7 +54,7 @@ def test_the_newest_checkpoint_is_read(tmp_path: Path) -> None:
 
 
 def test_a_missing_or_cut_off_checkpoint_is_told(tmp_path: Path) -> None:
-    config = write_run(tmp_path / "run", tmp_path, finished=False)
+    config = write_run(tmp_path / "run", tmp_path, saved_at=None)
     with pytest.raises(InputError, match="no checkpoint"):
         read_checkpoint(config, {})
     (config.parent / "nerfstudio_models" / "step-000000001.ckpt").write_bytes(b"PK\x03\x04cut off")
@@ -69,11 +70,21 @@ def test_finished_runs_are_found_by_their_data_and_in_the_order_of_time(
     old = write_run(method / "b", Path("captures/door.v1"))
     new = write_run(method / "a", tmp_path / "captures" / "door.v1")
     write_run(method / "c", Path("captures/door.v2"))
-    write_run(method / "d", Path("captures/door.v1"), finished=False)
+    write_run(method / "d", Path("captures/door.v1"), saved_at=None)
     write_run(Path("outputs/door/splatart-joint/e"), Path("captures/door.v1"))
     os.utime(old, (1, 1))
     os.utime(new, (2, 2))
     assert finished_runs(Path("captures/door.v1"), "splatart-pose") == [old, new]
+
+
+def test_a_run_that_was_killed_between_two_of_its_steps_is_not_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    method = Path("outputs/door/splatart-semantic")
+    finished = write_run(method / "a", Path("door"))
+    write_run(method / "b", Path("door"), saved_at=5)
+    assert finished_runs(Path("door"), "splatart-semantic") == [finished]
 
 
 def test_an_uncaught_input_error_ends_a_process_with_one_sentence() -> None:

@@ -1,4 +1,5 @@
 import json
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.colormaps import apply_colormap
 
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.view import View
+from splatart_ns.errors import InputError
 from splatart_ns.plugin.datamanager import SplatartDatamanager, SplatartDatamanagerConfig
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.stages.hull import carve
@@ -39,6 +42,29 @@ def test_batches_have_alpha_and_labels_and_frames_without_labels_say_so(capture_
             assert (image[..., 3:][labels > 0] > 0).float().mean() > 0.95
     assert labelled == {i for i, frame in enumerate(frames) if frame.labels is not None}
     assert 0 < len(labelled) < len(frames)
+
+
+def test_other_data_parsers_are_refused(capture_dir: Path) -> None:
+    config = SplatartDatamanagerConfig(dataparser=NerfstudioDataParserConfig(data=capture_dir / "state_00"))
+    with pytest.raises(InputError, match="is NerfstudioDataParserConfig, .* splatart-capture"):
+        config.setup(device="cpu")
+
+
+@pytest.mark.parametrize("factor", [0.4, 2.0, 0.66, 0.33, 0.0, -0.5, 1e-9, math.inf, math.nan])
+def test_images_that_would_not_be_a_whole_number_of_times_smaller_are_refused(capture_dir: Path, factor: float) -> None:
+    with pytest.raises(InputError, match=f"camera-res-scale-factor is {factor}; give 1 / n"):
+        manage(capture_dir, camera_res_scale_factor=factor)
+
+
+@pytest.mark.parametrize(("factor", "side"), [(1.0, 64), (0.5, 32), (0.25, 16), (0.333, 21), (0.1667, 10), (1 / 60, 1)])
+def test_cameras_are_as_large_as_images_that_are_made_smaller(capture_dir: Path, factor: float, side: int) -> None:
+    manager = manage(capture_dir, camera_res_scale_factor=factor)
+    camera, batch = manager.next_train(0)
+    assert batch["image"].shape == (side, side, 4) and camera.metadata["whole"] == (side, side)
+    view = manager.train_dataset.views[batch["image_idx"]]
+    K, (left, top, *_) = view.K, view.object_window()
+    expected = torch.tensor([K[0, 0], K[1, 1], K[0, 2] - left, K[1, 2] - top])
+    assert torch.allclose(torch.cat([camera.fx, camera.fy, camera.cx, camera.cy], -1), expected)
 
 
 def test_images_to_show_are_over_white_as_renders_are(capture_dir: Path, opaque_capture_dir: Path) -> None:

@@ -55,6 +55,14 @@ def test_an_object_has_a_radius_of_about_one(capture_dir: Path) -> None:
     assert torch.allclose(half_width.median(), torch.tensor(1.0), atol=0.1)
 
 
+def test_each_camera_takes_metadata_of_its_own_as_ns_export_gives_it(capture_dir: Path) -> None:
+    cameras = parse(capture_dir).cameras
+    alone = [cameras[i : i + 1] for i in range(2)]
+    for i, camera in enumerate(alone):
+        camera.metadata["cam_idx"] = i
+    assert [camera.metadata for camera in (*alone, cameras)] == [{"cam_idx": 0}, {"cam_idx": 1}, {}]
+
+
 def test_without_validation_views_the_test_views_are_evaluated(capture_dir: Path) -> None:
     assert parse(capture_dir, split="val").image_filenames == parse(capture_dir, split="test").image_filenames
 

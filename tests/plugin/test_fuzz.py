@@ -17,6 +17,7 @@ from splatart_ns.plugin.gaussians import SPLAT_SHAPES, splat_from_state
 from splatart_ns.plugin.semantic_run import find_semantic_runs
 
 CONFIG = """!!python/object:splatart_ns.plugin.joint.JointTrainerConfig
+max_num_iterations: 10
 method_name: splatart-semantic
 pipeline: !!python/object:a.B
   datamanager: !!python/object:c.D
@@ -28,7 +29,10 @@ pipeline: !!python/object:a.B
       state: 1
 _target: !!python/name:os.system ''
 """
-TREE = {"pipeline": {"datamanager": {"data": ["/", "capture"], "dataparser": {"data": ["/", "capture"], "state": 1}}}}
+TREE = {
+    "max_num_iterations": 10,
+    "pipeline": {"datamanager": {"data": ["/", "capture"], "dataparser": {"data": ["/", "capture"], "state": 1}}},
+}
 
 
 @pytest.fixture

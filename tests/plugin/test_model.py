@@ -43,6 +43,18 @@ def test_a_rasterizer_for_the_cpu_is_refused_on_a_gpu(monkeypatch) -> None:
         config.setup(scene_box=None, num_train_data=1, metadata={}, device="cuda")
 
 
+def test_cameras_that_later_stages_would_not_know_of_are_not_optimised() -> None:
+    config = SplatartModelConfig()
+    config.camera_optimizer.mode = "SO3xR3"
+    with pytest.raises(InputError, match="mode is SO3xR3, .*--pipeline.model.refine-cameras on"):
+        config.setup(scene_box=None, num_train_data=1, metadata={})
+
+
+def test_a_bilateral_grid_is_refused() -> None:
+    with pytest.raises(InputError, match="use-bilateral-grid is True, .* leave it out"):
+        SplatartModelConfig(use_bilateral_grid=True).setup(scene_box=None, num_train_data=1, metadata={})
+
+
 def test_nothing_is_asked_of_the_network(semantic_trainer, capture_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_, **__):
         raise AssertionError("a connection was opened")

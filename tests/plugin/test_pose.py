@@ -1,6 +1,7 @@
 import copy
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,10 +10,12 @@ import torch
 from nerfstudio.engine.trainer import Trainer
 
 from splatart_ns.capture.check import require_valid
+from splatart_ns.capture.formats import load_capture
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import se3_exp, so3_log
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.plugin.pose import MOST, RATES
+from splatart_ns.plugin.semantic_run import read_state
 from splatart_ns.stages.render_choice import InitialMotion
 from splatart_ns.stages.thinning import BUDGET, LARGEST_SHARE, ROUNDS
 from splatart_ns.stages.world import WorldFit
@@ -141,8 +144,68 @@ def test_only_in_one_world_is_what_looks_still_held_still(pose_trainer, monkeypa
     world = WorldFit(torch.eye(4).double(), torch.zeros(7, 7).double(), 1.0)
     monkeypatch.setattr("splatart_ns.plugin.pose.initial_motion", lambda *_: still)
     monkeypatch.setattr("splatart_ns.plugin.pose.fit_worlds", lambda *_: (1, [world]))
+    # The runs are of one world.
+    monkeypatch.setattr("splatart_ns.plugin.dataparser.focus_on_focus", lambda *said: replace(said[0], worlds=said[1]))
     pipeline = pose_trainer(worlds=worlds).pipeline
     assert pipeline._frozen[1].tolist() == [worlds == "shared"] * 2
+
+
+def test_semantic_runs_that_are_not_one_of_each_state_in_order_are_refused(pose_trainer, semantic_runs):
+    first, second = semantic_runs
+    for runs, told in {
+        (second, first): f"{second} is given for state_00 and was trained on state_01",
+        (first, first): f"{first} is given for state_01 and was trained on state_00",
+        (first,): "names 1 of the runs of .* which has 2 states",
+        (first, second, second): "names 3 of the runs of .* which has 2 states",
+    }.items():
+        with pytest.raises(InputError, match=told):
+            pose_trainer(init="centroids", semantic_runs=runs)
+
+
+def move_a_camera(state: Path, meta: dict) -> None:
+    next(f for f in meta["frames"] if f["file_path"] in meta["train_filenames"])["transform_matrix"][0][3] += 0.01
+
+
+def exchange_an_image(state: Path, meta: dict) -> None:
+    first, second = (state / name for name in meta["train_filenames"][:2])
+    first.write_bytes(second.read_bytes())
+
+
+def split_otherwise(state: Path, meta: dict) -> None:
+    meta["train_filenames"][0], meta["test_filenames"][0] = meta["test_filenames"][0], meta["train_filenames"][0]
+
+
+def zoom(state: Path, meta: dict) -> None:
+    meta["fl_x"] *= 1.01
+
+
+@pytest.mark.parametrize("change", [move_a_camera, exchange_an_image, split_otherwise, zoom])
+@pytest.mark.parametrize("changed", ["state_00", "state_01"])
+def test_a_semantic_run_of_what_a_capture_was_before_is_refused(capture_dir, semantic_runs, tmp_path, change, changed):
+    capture = shutil.copytree(capture_dir, tmp_path / "capture")
+    file = capture / changed / "transforms.json"
+    meta = json.loads(file.read_text())
+    change(file.parent, meta)
+    file.write_text(json.dumps(meta))
+    with pytest.raises(InputError, match="was trained on other frames, cameras .* splatart-capture --state"):
+        for state, run in enumerate(semantic_runs):
+            read_state(load_capture(capture), state, run, 2, "cpu")
+
+
+def test_a_semantic_run_of_a_capture_that_has_moved_is_read(capture_dir, semantic_runs, tmp_path):
+    capture = load_capture(shutil.copytree(capture_dir, tmp_path / "elsewhere"))
+    read = read_state(capture, 1, semantic_runs[1], 2, "cpu")
+    assert [view.name for view in read.views] == [frame.name for frame in capture.states[1].split("train")]
+
+
+def test_a_semantic_run_of_an_earlier_version_is_refused(capture_dir, semantic_runs, tmp_path):
+    run = shutil.copytree(semantic_runs[0].parent, tmp_path / "run")
+    (file,) = run.glob("nerfstudio_models/*.ckpt")
+    checkpoint = torch.load(file)
+    del checkpoint["pipeline"]["_model.trained_on"]
+    torch.save(checkpoint, file)
+    with pytest.raises(InputError, match="has no '_model.trained_on' .* train that stage again"):
+        read_state(load_capture(capture_dir), 0, run / "config.yml", 2, "cpu")
 
 
 def test_a_missing_file_is_named(pose_trainer):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatart_ns.errors import InputError
 from splatart_ns.plugin import semantic
 from splatart_ns.plugin.semantic_run import learned_views
 from splatart_ns.stages.camera_refinement import PASSES
@@ -217,3 +218,16 @@ def test_refined_cameras_stay_after_an_evaluation_which_loads_images_again(captu
     refined = pipeline.datamanager.train_cameras.camera_to_worlds
     assert not torch.equal(refined, given)
     assert torch.equal(pipeline.datamanager.train_dataset.cameras.camera_to_worlds, refined)
+
+
+@pytest.mark.parametrize("option", ["load_dir", "load_checkpoint"])
+def test_training_does_not_go_on_from_a_checkpoint_which_others_look_at(capture_dir, semantic_trainer, option):
+    trainer = semantic_trainer(capture_dir)
+    trainer.save_checkpoint(3)
+    file = trainer.checkpoint_dir / "step-000000003.ckpt"
+    setattr(trainer.config, option, file.parent if option == "load_dir" else file)
+    with pytest.raises(InputError, match="leave --load-dir and --load-checkpoint out"):
+        trainer.setup()
+    looked_at = trainer.config.pipeline.setup(device="cpu", test_mode="test")
+    looked_at.load_pipeline(torch.load(file)["pipeline"], 3)
+    assert torch.equal(looked_at.model.means, trainer.pipeline.model.means)

@@ -11,7 +11,7 @@ from splatart_ns.plugin.semantic_run import find_semantic_runs, learned_views
 
 def test_semantic_runs_that_are_not_there_are_named_by_state(capture_dir, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="--state 0"):
+    with pytest.raises(InputError, match="--state 0` first, or name .* by --pipeline.semantic-runs"):
         find_semantic_runs(capture_dir, 2)
 
 
@@ -29,8 +29,6 @@ def test_views_are_seen_as_stage_1_left_them(capture_dir):
     small = learned_views(capture, 0, checkpoint, downscale=2)
     assert [(view.width, *view.rgb.shape[:2]) for view in small] == [(32, 32, 32)] * len(views)
     assert all(view.depth is None for view in seen)
-    with pytest.raises(InputError, match="train it again"):
-        learned_views(capture, 0, {"_model.viewmats": moved, "_model.gains": checkpoint["_model.gains"]})
 
 
 def test_depth_that_no_other_view_confirms_is_left_out(depth_capture_dir):
