@@ -23,7 +23,14 @@ from splatart_ns.geometry.se3 import inverse
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
 from splatart_ns.plugin.pipeline import StagePipeline
 from splatart_ns.rasterize.ssim import l1_ssim_loss
-from splatart_ns.stages.camera_refinement import PASSES, camera_change, refine_cameras
+from splatart_ns.stages.camera_refinement import (
+    EXACT_PIXELS,
+    PASSES,
+    TRIED,
+    camera_change,
+    image_shift,
+    refine_cameras,
+)
 from splatart_ns.stages.exposure import at_gain, frame_gains, unevenness
 from splatart_ns.stages.hull import Slack, carve, slack
 from splatart_ns.stages.semantic import (
@@ -223,13 +230,6 @@ class SemanticPipeline(StagePipeline):
         self._has_voted = False
         self.findings: dict[str, Any] = {}
         self._slack = self.datamanager.slack
-        wanted = self.model.config.refine_cameras
-        self._refines = wanted == "on" or (wanted == "auto" and self._slack.pixels > 0)
-        if self._slack.pixels > 0 and not self._refines:
-            self.notes.append(
-                f"{self._state.name}: the silhouettes contradict each other by {self._slack.pixels} pixels, so cameras "
-                "or masks are not exact; --refine-cameras off leaves them so."
-            )
         dataset = self.datamanager.train_dataset
         self._labelled = {i for i, frame in enumerate(dataset.metadata["frames"]) if frame.labels is not None}
         if self.datamanager.test_mode == "val":
@@ -237,6 +237,15 @@ class SemanticPipeline(StagePipeline):
                 self.notes.append(f"{self._state.name}: {strange}; {OTHER_WORLDS_MEND}.")
             self._note_depth()
             self._views = list(dataset.views)
+            wanted, contradicted = self.model.config.refine_cameras, self._slack.pixels > 0
+            # Where no silhouettes tell whether cameras are exact, refining them does.
+            self._tries = wanted == "auto" and not contradicted and any(v.alpha is None for v in self._views)
+            self._refines = wanted == "on" or self._tries or (wanted == "auto" and contradicted)
+            if contradicted and not self._refines:
+                self.notes.append(
+                    f"{self._state.name}: the silhouettes contradict each other by {self._slack.pixels} pixels, so "
+                    "cameras or masks are not exact; --refine-cameras off leaves them so."
+                )
             self._given = torch.stack([view.viewmat for view in self._views]).double()
             self.model.viewmats = self._given.to(self.device)
             digest = training_digest(self.datamanager.capture, self.datamanager.dataparser.config.state)
@@ -298,28 +307,41 @@ class SemanticPipeline(StagePipeline):
     def _refine_cameras(self, step: int) -> None:
         """Where it is time for it, move the cameras of the training frames."""
         due = [p for p in PASSES if step == round(p.at * self.model.config.semantic_start)]
-        if not due:
+        if not due or not self._refines:
             return
-        model = self.model
-        model.viewmats = refine_cameras(model.splat.detach(), self._views, self._given, due[-1].pixels)
-        model.cameras_refined = torch.tensor(True, device=self.device)
-        pairs = zip(self._views, model.viewmats.float().cpu(), strict=True)
+        found = refine_cameras(self.model.splat.detach(), self._views, self._given, due[-1].pixels)
+        if self._tries and due[-1] is TRIED and image_shift(found, self._given, self._views) < EXACT_PIXELS:
+            self._refines = False
+            found = self._given.to(found)
+        self._move_cameras(found)
+        if self._refines and due[-1] is PASSES[-1]:
+            self._note_cameras()
+
+    def _move_cameras(self, viewmats: Tensor) -> None:
+        """Let the training frames have world-to-camera matrices [N, 4, 4]."""
+        self.model.viewmats = viewmats
+        self.model.cameras_refined = torch.tensor(self._refines, device=self.device)
+        pairs = zip(self._views, viewmats.float().cpu(), strict=True)
         self._views = [replace(view, viewmat=viewmat) for view, viewmat in pairs]
-        poses = inverse(model.viewmats) * torch.tensor([1.0, -1.0, -1.0, 1.0]).to(model.viewmats)
+        poses = inverse(viewmats) * torch.tensor([1.0, -1.0, -1.0, 1.0]).to(viewmats)
         # The datamanager takes a copy of its dataset's whenever it loads images, those of an evaluation, too.
         for cameras in (self.datamanager.train_cameras, self.datamanager.train_dataset.cameras):
             cameras.camera_to_worlds.copy_(poses[:, :3].to(cameras.camera_to_worlds))
         if self._slack.pixels > 0:
             self._slack = slack(self._views)[0]
-        if due[-1] is PASSES[-1]:
-            change = camera_change(model.viewmats, self._given)
-            before, now = self.datamanager.slack.pixels, self._slack.pixels
-            self.findings["cameras"] = {**asdict(change), "slack_pixels": [before, now]}
-            self.notes.append(
-                f"{self._state.name}: the cameras contradicted each other by {before} pixels; they were turned by "
-                f"{change.degrees:.2f} deg and moved by {change.percent:.2f} % of their distance, and now do so by "
-                f"{now}."
-            )
+
+    def _note_cameras(self) -> None:
+        """Say by how much cameras were moved, and why."""
+        viewmats = self.model.viewmats
+        change, shift = camera_change(viewmats, self._given), image_shift(viewmats, self._given, self._views)
+        before, now = self.datamanager.slack.pixels, self._slack.pixels
+        self.findings["cameras"] = {**asdict(change), "pixels": shift, "slack_pixels": [before, now]}
+        moved = f"turned by {change.degrees:.2f} deg and moved by {change.percent:.2f} % of their distance"
+        if before > 0:
+            why = f"contradicted each other by {before} pixels; they were {moved}, and now do so by {now}"
+        else:
+            why = f"were {moved}, so that images agree: {shift:.1f} pixels where they look"
+        self.notes.append(f"{self._state.name}: the cameras {why}.")
 
     def _even_exposures(self, step: int) -> None:
         """Where it is time for it and they differ, bring the training frames to one exposure."""

@@ -1,4 +1,4 @@
-"""Camera poses of one state refined against its splat, where the silhouettes say that they are not exact."""
+"""Camera poses of one state refined against its splat, where silhouettes, or images, say that they are not exact."""
 
 from __future__ import annotations
 
@@ -46,8 +46,9 @@ def refine_cameras(splat: Splat, views: Sequence[View], given: Tensor, pixels: i
 
     Args:
         splat: The state's Gaussians.
-        views: One of each camera, where it is now; those without a silhouette stay.
-        pixels: About how many pixels of the object a view is compared in.
+        views: One of each camera, where it is now. Those without a silhouette are compared with all that the splat has,
+            what surrounds the object, too.
+        pixels: About how many pixels of that a view is compared in.
     """
     weight = splat.opacities.double()
     centroid = weight @ splat.means.double() / weight.sum()
@@ -55,9 +56,7 @@ def refine_cameras(splat: Splat, views: Sequence[View], given: Tensor, pixels: i
     viewmats = torch.stack([view.viewmat for view in views]).to(centroid)
     moved = torch.zeros(len(views), dtype=torch.bool)
     for i, view in enumerate(views):
-        if view.alpha is None:
-            continue
-        inside = view.alpha > 127
+        inside = torch.ones(view.rgb.shape[:2], dtype=torch.bool) if view.alpha is None else view.alpha > 127
         factor = max(1, int((float(inside.sum()) / pixels) ** 0.5))
         seen = part_view(replace(view, labels=inside.to(torch.uint8)), 1, factor, splat.means.device)
         if seen is not None:
@@ -129,6 +128,20 @@ def _without_drift(viewmats: Tensor, given: Tensor, centroid: Tensor) -> Tensor:
     out = viewmats.clone()
     out[:, :3, 3] += after / nearer - after
     return out
+
+
+TRIED = PASSES[4]
+"""Where no silhouettes tell whether cameras are exact, they are refined up to here, and then are or are not."""
+EXACT_PIXELS = 0.6
+"""Cameras that this has moved by less are."""
+
+
+def image_shift(viewmats: Tensor, given: Tensor, views: Sequence[View]) -> float:
+    """By how many pixels, root mean square, world-to-camera matrices [N, 4, 4] see the world's origin elsewhere than
+    the `given` ones [N, 4, 4] do."""
+    focal = torch.stack([view.K[0, 0] for view in views]).to(viewmats)
+    now, before = (V[:, :2, 3] / V[:, 2:3, 3] * focal[:, None] for V in (viewmats, given.to(viewmats)))
+    return float((now - before).square().sum(-1).mean().sqrt())
 
 
 @dataclass(frozen=True)

@@ -67,10 +67,10 @@ HARDLY_ROUND = 2.0
 are blind to its turn. Wheels that are half hidden or lit from one side, knobs and a turntable that turned measured 1.0
 to 1.6, 20 parts that rest 3.3 to 29."""
 CLEARLY, CLEAR_SHARE = 1.5, 0.3
-"""Or, for cameras that are off make all cost more, this many times by turns of twice as much, and this share of what the
-worst of all turns costs more: what is lit from one side costs (1 - cos 30 deg) / 2 of that, or its root, 0.07 to 0.26.
-A fridge's body seen from above by such cameras measured 1.9 and 0.38 (1.4 in place of `HARDLY_ROUND`), three parts
-that rest 5.5 to 13 and 0.38 to 0.56, nine wheels 1.2 and 0.07 at most."""
+"""Or, for cameras that are off make all cost more, this many times by turns of twice as much, and this share of what
+the worst of all turns costs more: what is lit from one side costs (1 - cos 30 deg) / 2 of that, or its root, 0.07 to
+0.26. A fridge's body seen from above by such cameras measured 1.9 and 0.38 (1.4 in place of `HARDLY_ROUND`), three
+parts that rest 5.5 to 13 and 0.38 to 0.56, nine wheels 1.2 and 0.07 at most."""
 TOLD_SHARE = 0.05
 """And by this share of what the worst costs more: else it may be light, whose wide dips measured 0.02 at most."""
 UNTURNED = 5

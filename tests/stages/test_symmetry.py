@@ -191,8 +191,10 @@ def test_a_bar_whose_turn_silhouettes_hardly_tell_rests(hardly_round, monkeypatc
 def by_cameras_that_are_off(scene, degrees=0.35):
     splats, views = scene
     rng = torch.Generator().manual_seed(0)
-    off = [[se3_exp(math.radians(degrees) * torch.randn(6, generator=rng)) for _ in some] for some in views]
-    moved = [[replace(v, viewmat=d @ v.viewmat) for v, d in zip(*both, strict=True)] for both in zip(views, off)]
+    moved = []
+    for some in views:
+        off = [se3_exp(math.radians(degrees) * torch.randn(6, generator=rng)) for _ in some]
+        moved.append([replace(v, viewmat=d @ v.viewmat) for v, d in zip(some, off, strict=True)])
     return splats, tuple(moved)
 
 
