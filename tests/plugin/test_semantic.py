@@ -11,7 +11,7 @@ import torch
 from splatart_ns.errors import InputError
 from splatart_ns.plugin import semantic
 from splatart_ns.plugin.semantic_run import learned_views
-from splatart_ns.stages.camera_refinement import PASSES
+from splatart_ns.stages.camera_refinement import PASSES, TRIED
 from splatart_ns.stages.hull import Slack
 from splatart_ns.stages.semantic import ballots
 from splatart_ns.stages.spread import TOLD, spread
@@ -214,10 +214,33 @@ def test_refined_cameras_stay_after_an_evaluation_which_loads_images_again(captu
     assert pipeline.datamanager.cached_train  # is loaded, and the cameras with it
     pipeline.datamanager.train_cameras = copy.deepcopy(pipeline.datamanager.train_cameras)  # as on a GPU
     given = pipeline.datamanager.train_dataset.cameras.camera_to_worlds.clone()
+    pipeline._refines = True
     pipeline._refine_cameras(round(PASSES[0].at * 300))
     refined = pipeline.datamanager.train_cameras.camera_to_worlds
     assert not torch.equal(refined, given)
     assert torch.equal(pipeline.datamanager.train_dataset.cameras.camera_to_worlds, refined)
+
+
+@pytest.mark.parametrize("pixels, moved", [(0.3, False), (1.0, True)])
+def test_cameras_of_images_without_silhouettes_move_if_that_is_by_pixels(
+    opaque_capture_dir, semantic_trainer, monkeypatch, pixels, moved
+):
+    pipeline = semantic_trainer(opaque_capture_dir, steps=301, semantic_start=300).pipeline
+    given = pipeline.model.viewmats.clone()
+
+    def shifted(splat, views, given, compared):
+        found = given.clone()
+        found[:, 0, 3] += pixels * given[:, 2, 3] / torch.stack([view.K[0, 0] for view in views])
+        return found
+
+    monkeypatch.setattr(semantic, "refine_cameras", shifted)
+    for each in PASSES:
+        pipeline._refine_cameras(round(each.at * 300))
+        assert torch.equal(pipeline.model.viewmats, given) == (not moved and each.at >= TRIED.at)
+    assert bool(pipeline.model.cameras_refined) == moved
+    assert ("cameras" in pipeline.findings) == moved == any("1.0 pixels" in note for note in pipeline.notes)
+    seen = torch.stack([view.viewmat for view in pipeline._views])
+    assert torch.equal(seen, pipeline.model.viewmats.float().cpu())
 
 
 @pytest.mark.parametrize("option", ["load_dir", "load_checkpoint"])
