@@ -12,7 +12,7 @@ import numpy as np
 
 from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame, Normalization, Problem, State
 from splatart_ns.capture.formats import read_capture
-from splatart_ns.capture.images import read_depth_for, read_image, read_labels, read_mask, read_sized
+from splatart_ns.capture.images import read_depth_for, read_image, read_labels, read_mask, read_silhouette, read_sized
 from splatart_ns.capture.view import load_points
 from splatart_ns.capture.worlds import OTHER_WORLDS_MEND, looks_elsewhere
 from splatart_ns.errors import InputError
@@ -100,7 +100,7 @@ def _look(frame: Frame, parts: dict[int, str]) -> _Content:
             return None
 
     image = read(frame.image, read_image)
-    silhouette = read(frame.object_mask, read_mask)
+    silhouette = read(frame.object_mask, read_silhouette)
     if frame.object_mask is None and image is not None and image.shape[2] == 4 and not (image[..., 3] == 255).all():
         silhouette = image[..., 3]
     if silhouette is not None:

@@ -27,6 +27,8 @@ _JPEG = b"\xff\xd8\xff"
 _PNG_COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGBA"}
 _HALF = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])  # OpenCV's pixel centres lie at integers
 MAX_LABEL = UNLABELLED - 1
+_WHITE = 250
+"""Of 255; an object that soft edges leave darker is no wider than a pixel."""
 _MOST_BYTES, _MOST_PIXELS = 1 << 30, 1 << 27
 
 
@@ -67,15 +69,25 @@ def read_labels(path: Path) -> np.ndarray:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """A silhouette or a mask, uint8 [H, W], 0 outside and 255 inside; masks of 0 and 1 are stretched to 0 and 255."""
-    mask = _decode(path, read_bytes(path))
-    if mask.dtype != np.uint16 or mask.max(initial=0) > 1:
-        mask = _to_bytes(path, mask)
-    if mask.ndim == 3:
-        if not (mask[..., :1] == mask[..., :3]).all():
-            raise CaptureError(path, "the mask is a colour image", "save it with one grey channel")
-        mask = np.ascontiguousarray(mask[..., 0])
-    return (mask * 255).astype(np.uint8) if mask.max(initial=0) <= 1 else mask
+    """The pixels that count, uint8 [H, W]: 255 where the file is not 0, as in nerfstudio, else 0."""
+    return np.where(_mask_channel(path), np.uint8(255), np.uint8(0))
+
+
+def read_silhouette(path: Path) -> np.ndarray:
+    """How much of each pixel an object covers, uint8 [H, W], 255 for all of it.
+
+    A file without white holds 0 and one other value, which is stretched to 255, so that no object is half transparent.
+    """
+    pixels = _mask_channel(path)
+    silhouette = _to_bytes(path, pixels)
+    if silhouette.max(initial=0) >= _WHITE:
+        return silhouette
+    values = np.unique(pixels).tolist()
+    if len({*values} - {0}) > 1:
+        told = values if len(values) <= 5 else [*values[:3], "...", values[-1]]
+        found = f"the mask is nowhere white: its values are {', '.join(map(str, told))}"
+        raise CaptureError(path, found, "write 255 where the object is and 0 elsewhere")
+    return np.where(pixels, np.uint8(255), np.uint8(0))
 
 
 def read_depth(path: Path, unit: float = 1e-3) -> np.ndarray:
@@ -270,6 +282,16 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
         pixels = None
     if pixels is None:
         raise CaptureError(path, "the image is cut off, damaged or of an unknown kind", "copy or export it again")
+    return pixels
+
+
+def _mask_channel(path: Path) -> np.ndarray:
+    """The one channel [H, W] that a mask's pixels have."""
+    pixels = _decode(path, read_bytes(path))
+    if pixels.ndim == 3:
+        if not (pixels[..., :1] == pixels[..., :3]).all():
+            raise CaptureError(path, "the mask is a colour image", "save it with one grey channel")
+        pixels = np.ascontiguousarray(pixels[..., 0])
     return pixels
 
 

@@ -20,7 +20,7 @@ from splatart_ns.capture.capture import Normalization
 from splatart_ns.capture.check import check_capture
 from splatart_ns.capture.examination import examine
 from splatart_ns.capture.formats import load_capture
-from splatart_ns.capture.images import image_size, read_depth, read_image, read_labels, read_mask
+from splatart_ns.capture.images import image_size, read_depth, read_image, read_labels, read_mask, read_silhouette
 from splatart_ns.capture.label_import import import_labels
 from splatart_ns.capture.view import load_points
 from splatart_ns.errors import InputError
@@ -64,9 +64,10 @@ POINTS = [
 def test_any_image(tmp_path, data):
     file = tmp_path / "image.png"
     file.write_bytes(data)
-    image, mask = one_sentence(read_image, file), one_sentence(read_mask, file)
+    image = one_sentence(read_image, file)
     assert image is None or (image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] in (3, 4))
-    assert mask is None or (mask.dtype == np.uint8 and mask.ndim == 2)
+    for mask in (one_sentence(read_mask, file), one_sentence(read_silhouette, file)):
+        assert mask is None or (mask.dtype == np.uint8 and mask.ndim == 2)
     one_sentence(image_size, file)
 
 
@@ -194,7 +195,7 @@ def bomb(width, height):
     )
 
 
-@pytest.mark.parametrize("reader", [read_image, read_labels, read_mask, read_depth])
+@pytest.mark.parametrize("reader", [read_image, read_labels, read_mask, read_silhouette, read_depth])
 @pytest.mark.parametrize("size", [(60_000, 60_000), (12_000, 12_000), (2**31 - 1, 2**31 - 1)])
 def test_an_image_that_promises_too_many_pixels_is_not_decoded(tmp_path, monkeypatch, reader, size):
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))

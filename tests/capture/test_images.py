@@ -14,6 +14,7 @@ from splatart_ns.capture.images import (
     read_image,
     read_labels,
     read_mask,
+    read_silhouette,
     read_sized,
     undistort,
     undistort_labels,
@@ -64,7 +65,7 @@ def test_a_cut_off_image_is_an_input_error(tmp_path, suffix, keep):
 def test_a_missing_file_a_folder_and_a_stranger_are_input_errors(tmp_path):
     (tmp_path / "text.png").write_text("no image")
     for name in ("nothing.png", ".", "text.png"):
-        for reader in (read_image, read_labels, read_mask, read_depth, image_size):
+        for reader in (read_image, read_labels, read_mask, read_silhouette, read_depth, image_size):
             with pytest.raises(InputError):
                 reader(tmp_path / name)
 
@@ -96,18 +97,33 @@ def test_coloured_palette_lossy_and_one_bit_labels_are_input_errors(tmp_path):
         read_labels(jpeg)
 
 
-def test_masks_of_zero_and_one_are_stretched(tmp_path):
-    binary = np.array([[0, 1]], np.uint8)
-    assert read_mask(write(tmp_path / "a.png", binary)).tolist() == [[0, 255]]
-    assert read_mask(write(tmp_path / "d.png", binary.astype(np.uint16))).tolist() == [[0, 255]]
-    assert read_mask(write(tmp_path / "e.png", binary.astype(np.uint16) * 65535)).tolist() == [[0, 255]]
-    assert read_mask(write(tmp_path / "b.png", np.array([[0, 90]], np.uint8))).tolist() == [[0, 90]]
-    assert read_mask(write(tmp_path / "c.png", np.repeat(binary[..., None] * 255, 3, axis=2))).tolist() == [[0, 255]]
+@pytest.mark.parametrize("inside", [1, 3, 90, 128, 255])
+def test_masks_of_zero_and_another_value_are_stretched(tmp_path, inside):
+    mask = np.array([[0, inside]], np.uint8)
+    deep = mask.astype(np.uint16)
+    for pixels in (mask, deep, deep * 257, np.repeat(mask[..., None], 3, axis=2)):
+        for reader in (read_mask, read_silhouette):
+            assert reader(write(tmp_path / "a.png", pixels)).tolist() == [[0, 255]]
+
+
+def test_silhouettes_keep_their_soft_edges_and_masks_do_not(tmp_path):
+    soft = write(tmp_path / "a.png", np.array([[0, 90, 255]], np.uint8))
+    assert read_silhouette(soft).tolist() == [[0, 90, 255]]
+    assert read_mask(soft).tolist() == [[0, 255, 255]]
+
+
+@pytest.mark.parametrize(("values", "told"), [([0, 1, 2, 3], "0, 1, 2, 3"), (range(9), "0, 1, 2, ..., 8")])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_silhouette_without_white_is_refused_with_its_values(tmp_path, values, told, dtype):
+    path = write(tmp_path / "a.png", np.array([values], dtype))
+    with pytest.raises(InputError, match=f"its values are {told}; write 255 where the object is"):
+        read_silhouette(path)
+    assert read_mask(path).tolist() == [[0] + [255] * (len(values) - 1)]  # what is not 0 counts
 
 
 def test_a_coloured_mask_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="one grey channel"):
-        read_mask(write(tmp_path / "a.png", np.array([[[0, 0, 200]]], np.uint8)))
+        read_silhouette(write(tmp_path / "a.png", np.array([[[0, 0, 200]]], np.uint8)))
 
 
 def test_depth_is_in_millimetres_in_both_forms(tmp_path):
