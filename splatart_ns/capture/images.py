@@ -286,13 +286,19 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
 
 
 def _mask_channel(path: Path) -> np.ndarray:
-    """The one channel [H, W] that a mask's pixels have."""
+    """The channel [H, W] that holds a mask: the grey, or the alpha where it varies and the colour does not."""
     pixels = _decode(path, read_bytes(path))
-    if pixels.ndim == 3:
-        if not (pixels[..., :1] == pixels[..., :3]).all():
-            raise CaptureError(path, "the mask is a colour image", "save it with one grey channel")
-        pixels = np.ascontiguousarray(pixels[..., 0])
-    return pixels
+    if pixels.ndim == 2:
+        return pixels
+    colour, alpha = pixels[..., :3], pixels[..., -1]
+    if pixels.shape[2] == 4 and np.ptp(alpha) > 0:
+        shown = colour[alpha > 0]
+        if (shown != shown[0]).any():
+            raise CaptureError(path, "the mask has colours and an alpha channel", "save it with one grey channel")
+        return np.ascontiguousarray(alpha)
+    if not (colour == colour[..., :1]).all():
+        raise CaptureError(path, "the mask is a colour image", "save it with one grey channel")
+    return np.ascontiguousarray(colour[..., 0])
 
 
 def _to_bytes(path: Path, pixels: np.ndarray) -> np.ndarray:

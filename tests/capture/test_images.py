@@ -126,6 +126,29 @@ def test_a_coloured_mask_is_an_input_error(tmp_path):
         read_silhouette(write(tmp_path / "a.png", np.array([[[0, 0, 200]]], np.uint8)))
 
 
+@pytest.mark.parametrize("shown", [0, 200, 255])
+@pytest.mark.parametrize("hidden", [0, 255])
+def test_a_mask_of_one_colour_has_its_shape_in_the_alpha(tmp_path, shown, hidden):
+    alpha = np.array([[0, 100, 255]], np.uint8)
+    grey = np.where(alpha > 0, shown, hidden).astype(np.uint8)
+    Image.fromarray(np.stack([grey, alpha], axis=-1), mode="LA").save(tmp_path / "la.png")
+    write(tmp_path / "rgba.png", np.stack([grey, grey, grey, alpha], axis=-1))
+    for file in ("la.png", "rgba.png"):
+        assert read_silhouette(tmp_path / file).tolist() == [[0, 100, 255]]
+
+
+def test_an_alpha_that_is_the_same_everywhere_says_nothing_of_a_mask(tmp_path):
+    for alpha in (0, 255):
+        mask = np.array([[[0, 0, 0, alpha], [255, 255, 255, alpha]]], np.uint8)
+        assert read_silhouette(write(tmp_path / "a.png", mask)).tolist() == [[0, 255]]
+
+
+def test_a_mask_of_which_colour_and_alpha_differ_is_refused(tmp_path):
+    mask = np.array([[[0, 0, 0, 255], [255, 255, 255, 255], [0, 0, 0, 0]]], np.uint8)
+    with pytest.raises(InputError, match="colours and an alpha channel; save it with one grey channel"):
+        read_silhouette(write(tmp_path / "a.png", mask))
+
+
 def test_depth_is_in_millimetres_in_both_forms(tmp_path):
     counts = np.array([[0, 1500]], np.uint16)
     np.save(tmp_path / "b.npy", np.array([[np.nan, 1500.0]]))
