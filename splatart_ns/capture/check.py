@@ -202,13 +202,15 @@ def _gaps(capture: Capture, contents: Sequence[_Content]) -> list[int]:
 
 
 def _gap_problem(capture: Capture, pixels: np.ndarray, gaps: Sequence[int]) -> Problem:
-    """An error unless all training frames are labelled, and two parts in two states, which are worth a fit."""
+    """An error unless all training frames are labelled, and two parts in two states, which are worth a fit that the
+    gaps do not more than double."""
     whole = all(frame.labels is not None for state in capture.states for frame in state.split("train"))
     compared = int(((pixels[:, 1:UNLABELLED] > 0).sum(axis=0) > 1).sum())
     missing = ", ".join(map(str, gaps[:3])) + (", ..." if len(gaps) > 3 else "")
     found = f"the labels go up to {max(capture.parts)}, but none is {missing}"
     mend = "number the parts 1, 2, ... without gaps, or correct stray pixels of large numbers"
-    return Problem("warning" if whole and compared > 1 else "error", capture.path, found, mend)
+    few = 2 * len(gaps) <= len(capture.parts)
+    return Problem("warning" if whole and few and compared > 1 else "error", capture.path, found, mend)
 
 
 def _check_labels(capture: Capture, pixels: np.ndarray) -> Iterator[Problem]:

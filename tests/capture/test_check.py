@@ -215,14 +215,25 @@ def test_one_image_cannot_show_two_states(capture_folder, edit):
 
 def test_numbers_that_labels_without_classes_leave_out_are_one_problem(capture_folder, edit):
     for k in range(2):
-        relabel(capture_folder / f"state_0{k}", 2, 200)
+        relabel(capture_folder / f"state_0{k}", 2, 4)
+        relabel(capture_folder / f"state_0{k}", 1, 2)
         edit(capture_folder / f"state_0{k}/transforms.json", lambda m: m.pop("semantic_classes"))
-    told = ["capture: the labels go up to 200, but none is 2, 3, 4, ..."]
+    told = ["capture: the labels go up to 4, but none is 1, 3"]
     problems = check_capture(capture_folder)
     assert (found(problems), found(problems, "warning")) == ([], told)
 
     edit(capture_folder / "state_01/transforms.json", lambda m: m["frames"][0].pop("semantics_path"))
     assert found(check_capture(capture_folder)) == told  # that frame may show them
+
+
+def test_more_gaps_than_numbers_are_an_error(capture_folder, edit):
+    for k in range(2):
+        relabel(capture_folder / f"state_0{k}", 1, 80)
+        relabel(capture_folder / f"state_0{k}", 2, 160)
+        edit(capture_folder / f"state_0{k}/transforms.json", lambda m: m.pop("semantic_classes"))
+    (problem,) = check_capture(capture_folder)
+    assert problem.severity == "error" and "up to 160, but none is 1, 2, 3, ..." in problem.message
+    assert problem.mend.startswith("number the parts 1, 2, ... without gaps")
 
 
 def test_no_labels_at_all_is_one_error(capture_folder):
