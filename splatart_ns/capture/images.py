@@ -25,6 +25,7 @@ from splatart_ns.files import replacing
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
 _PNG_COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGBA"}
+_LABELS_MEND = "save the part ids themselves in one grey channel of 8 or 16 bits, without colours"
 _HALF = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])  # OpenCV's pixel centres lie at integers
 MAX_LABEL = UNLABELLED - 1
 _WHITE = 250
@@ -44,19 +45,22 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def read_labels(path: Path) -> np.ndarray:
-    """Part ids, uint8 [H, W]: 0 background, 1..254 parts, 255 unlabelled; from a one-channel PNG of 8 or 16 bits."""
+    """Part ids, uint8 [H, W]: 0 background, 1..254 parts, 255 unlabelled; from a PNG of 8 or 16 bits.
+
+    They are the indices of a palette, as annotation tools write them, else the grey of one channel or of three.
+    """
     data = read_bytes(path)
     if not data.startswith(_PNG) or len(data) < 33:
         raise CaptureError(path, "labels are not a PNG file", "save the part ids as a one-channel 8- or 16-bit PNG")
     bits, colour_type = data[24], data[25]
-    if colour_type != 0 or bits < 8:
-        kind = _PNG_COLOUR_TYPES.get(colour_type, f"colour type {colour_type}")
-        raise CaptureError(
-            path,
-            f"labels are a {bits}-bit {kind} PNG",
-            "save the part ids themselves in one grey channel of 8 or 16 bits, without colours",
-        )
+    kind = _PNG_COLOUR_TYPES.get(colour_type, f"colour type {colour_type}")
     labels = _decode(path, data)
+    if kind == "palette":
+        labels = _palette_indices(path, data, labels)
+    elif kind == "RGB" and (labels == labels[..., :1]).all():
+        labels = np.ascontiguousarray(labels[..., 0])
+    elif kind != "grey" or bits < 8:
+        raise CaptureError(path, f"labels are a {bits}-bit {kind} PNG", _LABELS_MEND)
     if labels.dtype == np.uint16:
         if labels.max(initial=0) > UNLABELLED:
             raise CaptureError(
@@ -283,6 +287,19 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
     if pixels is None:
         raise CaptureError(path, "the image is cut off, damaged or of an unknown kind", "copy or export it again")
     return pixels
+
+
+def _palette_indices(path: Path, data: bytes, shown: np.ndarray) -> np.ndarray:
+    """The indices [H, W] of a PNG whose colours `shown` [H, W, 3 or 4] come from a palette."""
+    try:
+        with PIL.Image.open(io.BytesIO(data)) as image:
+            indices, palette = np.array(image), np.reshape(image.getpalette(), (-1, 3))
+    except Exception:  # Pillow lets whatever its parsers meet through
+        raise CaptureError(path, "the palette is damaged", "export the labels again") from None
+    # Programs that shrink files give greys a palette, too, in an order of their own.
+    if (palette == palette[:, :1]).all() and (shown[..., 0] != indices).any():
+        raise CaptureError(path, "labels are a palette PNG of greys that are not their indices", _LABELS_MEND)
+    return indices
 
 
 def _mask_channel(path: Path) -> np.ndarray:

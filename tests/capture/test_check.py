@@ -47,7 +47,7 @@ def test_every_frame_is_looked_at_and_every_problem_told(capture_folder):
     put(state / "images/0002.png", np.zeros((8, 16, 3), np.uint8))
     put(state / "labels/0002.png", np.zeros((8, 8), np.uint8))
     put(state / "labels/0003.png", np.full((16, 16), 9, np.uint8))
-    put(capture_folder / "state_01/labels/0007.png", np.zeros((16, 16, 3), np.uint8))
+    put(capture_folder / "state_01/labels/0007.png", np.full((16, 16, 3), [0, 0, 1], np.uint8))
     assert found(check_capture(capture_folder)) == [
         "0000.png: the file does not exist",
         "0001.png: the image is cut off, damaged or of an unknown kind",

@@ -8,6 +8,7 @@ import zlib
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 import trimesh
 from fuzzing import damaged_bytes, damaged_json, fuzzed, one_sentence
@@ -32,6 +33,14 @@ def encoded(suffix, pixels):
     return cv2.imencode(suffix, pixels)[1].tobytes()
 
 
+def palette_png():
+    image = PIL.Image.fromarray(RNG.integers(0, 4, (9, 7), np.uint8), mode="P")
+    image.putpalette(list(range(12)))
+    file = io.BytesIO()
+    image.save(file, "png")
+    return file.getvalue()
+
+
 def saved(array):
     file = io.BytesIO()
     np.save(file, array)
@@ -51,7 +60,7 @@ IMAGES = [
     encoded(".tiff", pixels(9, 7, dtype=np.float32)),
     encoded(".bmp", pixels(9, 7, 3)),
 ]
-LABELS = [encoded(".png", pixels(9, 7)), encoded(".png", pixels(9, 7, dtype=np.uint16)), *IMAGES[:1]]
+LABELS = [encoded(".png", pixels(9, 7)), encoded(".png", pixels(9, 7, dtype=np.uint16)), *IMAGES[:1], palette_png()]
 DEPTHS = [saved(RNG.random((9, 7))), saved(RNG.random((9, 7, 1)).astype(np.float32)), LABELS[1]]
 POINTS = [
     trimesh.PointCloud(RNG.random((20, 3)), colors=pixels(20, 4)).export(file_type="ply", encoding=encoding)

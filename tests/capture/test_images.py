@@ -82,15 +82,40 @@ def test_labels_above_254_are_an_input_error(tmp_path):
         read_labels(write(tmp_path / "a.png", np.array([[0, 300]], np.uint16)))
 
 
-def test_coloured_palette_lossy_and_one_bit_labels_are_input_errors(tmp_path):
+def write_palette(path, ids, colours):
+    image = Image.fromarray(np.array(ids, np.uint8), mode="P")
+    image.putpalette(np.ravel(colours).astype(np.uint8).tolist())
+    image.save(path)
+    return path
+
+
+@pytest.mark.parametrize("largest", [1, 3, 15, 254])
+def test_labels_are_the_indices_of_a_palette(tmp_path, largest):
+    ids = [[0, 1, largest]]
+    assert read_labels(write_palette(tmp_path / "a.png", ids, RNG.integers(0, 256, (largest + 1, 3)))).tolist() == ids
+    assert read_labels(write_palette(tmp_path / "b.png", ids, np.arange(768) // 3)).tolist() == ids
+
+
+def test_greys_of_a_palette_that_are_not_its_indices_are_an_input_error(tmp_path):
+    """A program that shrinks files leaves labels of 0, 2 and 3 so."""
+    path = write_palette(tmp_path / "a.png", [[0, 1, 2]], np.repeat([0, 2, 3], 3))
+    with pytest.raises(InputError, match="greys that are not their indices; save the part ids"):
+        read_labels(path)
+
+
+def test_three_equal_channels_are_labels(tmp_path):
+    ids = np.array([[0, 1], [2, 255]], np.uint8)
+    for dtype in (np.uint8, np.uint16):
+        path = write(tmp_path / "a.png", np.repeat(ids[..., None], 3, axis=2).astype(dtype))
+        assert read_labels(path).tolist() == ids.tolist()
+
+
+def test_coloured_lossy_and_one_bit_labels_are_input_errors(tmp_path):
     ids = np.array([[0, 1], [2, 3]], np.uint8)
-    colour = write(tmp_path / "colour.png", np.repeat(ids[..., None], 3, axis=2))
-    palette = Image.fromarray(ids, mode="P")
-    palette.putpalette(list(range(256)) * 3)
-    palette.save(tmp_path / "palette.png")
+    colour = write(tmp_path / "colour.png", np.stack([ids, ids, 0 * ids], axis=2))
     Image.fromarray(ids > 0).save(tmp_path / "bits.png")
     jpeg = write(tmp_path / "lossy.jpg", ids)
-    for path, word in ((colour, "RGB"), (tmp_path / "palette.png", "palette"), (tmp_path / "bits.png", "1-bit")):
+    for path, word in ((colour, "RGB"), (tmp_path / "bits.png", "1-bit")):
         with pytest.raises(InputError, match=word):
             read_labels(path)
     with pytest.raises(InputError, match="not a PNG"):
