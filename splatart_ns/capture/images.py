@@ -256,7 +256,8 @@ def downscale_labels(labels: np.ndarray, factor: int) -> np.ndarray:
 def read_bytes(path: Path, size: int = _MOST_BYTES + 1) -> bytes:
     """The first `size` bytes of a file, or all of at most 1 GiB."""
     if not os.path.isfile(path):
-        raise CaptureError(path, "the file does not exist", "add it or correct its path")
+        mend = "write / for \\ in its path" if "\\" in path.name else "add it or correct its path"
+        raise CaptureError(path, "the file does not exist", mend)
     try:
         with open(path, "rb") as file:
             data = file.read(size)

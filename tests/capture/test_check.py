@@ -105,6 +105,12 @@ def test_a_folder_that_cannot_be_read_is_named(capture_folder, monkeypatch):
     assert problem.file == capture_folder / "state_00" and "cannot be read" in problem.message
 
 
+def test_the_mend_of_a_windows_path_is_its_slashes(capture_folder, edit):
+    edit(capture_folder / FILE, lambda m: m["frames"][0].update(semantics_path="labels\\0000.png"))
+    (problem,) = check_capture(capture_folder)
+    assert problem.message == "the file does not exist" and problem.mend == "write / for \\ in its path"
+
+
 def test_a_broken_state_leaves_the_other_checked(capture_folder):
     (capture_folder / FILE).write_text("{")
     (capture_folder / "state_01/images/0000.png").unlink()
