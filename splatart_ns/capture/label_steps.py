@@ -16,13 +16,13 @@ def count_steps(labels: np.ndarray) -> np.ndarray:
     counts = np.zeros(2, int)
     for rows in (labels, labels.T):
         y, x = np.nonzero(rows[:, 2:-5] != rows[:, 3:-4])
-        ids = rows[y[:, None], x[:, None] + np.arange(8)]  # three pixels before a change, five after it
-        before, steady = ids[:, 2], (ids[:, :3] == ids[:, 2:3]).all(axis=1)
+        ids = rows[y, x + np.arange(8)[:, None]]  # three pixels before a change, five after it
+        ids = ids[:, (ids[0] == ids[2]) & (ids[1] == ids[2])]
         for width in range(3):
-            after, between = ids[:, 3 + width], ids[:, 3 : 3 + width]
-            low, high = np.minimum(before, after), np.maximum(before, after)
+            between, after = ids[3 : 3 + width], ids[3 + width : 6 + width]
+            low, high = np.minimum(ids[2], after[0]), np.maximum(ids[2], after[0])
             apart = (high - low > 1) & (high != UNLABELLED)
-            inside = ((between > low[:, None]) & (between < high[:, None])).all(axis=1)
-            goes_on = (ids[:, 3 + width : 6 + width] == after[:, None]).all(axis=1)
-            counts[min(width, 1)] += (steady & apart & inside & goes_on).sum()
+            inside = ((low < between) & (between < high)).all(axis=0)
+            goes_on = (after[1:] == after[0]).all(axis=0)
+            counts[min(width, 1)] += (apart & inside & goes_on).sum()
     return counts

@@ -159,6 +159,12 @@ def test_inverted_silhouettes_are_an_error_where_labels_tell(capture_folder, edi
     ]
 
 
+def test_an_object_mask_of_part_ids_is_an_error(capture_folder, edit):
+    edit(capture_folder / FILE, lambda m: [e.update(object_mask_path=e["semantics_path"]) for e in m["frames"][:2]])
+    told = "the mask is nowhere white: its values are 0, 1, 2"
+    assert found(check_capture(capture_folder)) == [f"0000.png: {told}", f"0001.png: {told}"]
+
+
 def test_opaque_images_are_told_from_silhouettes(capture_folder, edit):
     for file in (capture_folder / "state_00/images").iterdir():
         put(file, np.full((16, 16, 4), 255, np.uint8))
