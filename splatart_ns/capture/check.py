@@ -12,7 +12,8 @@ import numpy as np
 
 from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame, Normalization, Problem, State
 from splatart_ns.capture.formats import read_capture
-from splatart_ns.capture.images import read_depth_for, read_image, read_labels, read_mask, read_sized
+from splatart_ns.capture.images import read_depth_for, read_image, read_labels, read_mask, read_silhouette, read_sized
+from splatart_ns.capture.label_steps import count_steps
 from splatart_ns.capture.view import load_points
 from splatart_ns.capture.worlds import OTHER_WORLDS_MEND, looks_elsewhere
 from splatart_ns.errors import InputError
@@ -56,6 +57,7 @@ def check_structure(path: Path) -> tuple[Capture | None, list[Problem]]:
         if (strange := looks_elsewhere(capture, state)) is not None:
             problems.append(Problem("warning", capture.path / state.name, strange, OTHER_WORLDS_MEND))
         problems.extend(_check_silhouettes(capture, state, [by_frame[id(f)] for f in state.frames]))
+        problems.extend(_check_steps(capture, state, [by_frame[id(f)] for f in state.frames]))
         if (train := state.split("train")) and all(by_frame[id(f)].masked_out for f in train):
             found, mend = "the masks leave no pixel of any training frame", "white must be what counts: invert them"
             problems.append(Problem("error", capture.path / state.name, found, mend))
@@ -71,6 +73,11 @@ def check_structure(path: Path) -> tuple[Capture | None, list[Problem]]:
 
 _INVERTED = 0.9
 """Silhouettes are inverted if they leave out more than this share of all labelled pixels."""
+_BLURRED, _ENOUGH_STEPS = 0.3, 100
+"""Labels are interpolated if more than this share of a state's steps, of which there are enough, leads over ids in
+between. In 72 captures it was at most 0.17 (tiny parts; 0.07 in all others), 0.22 halved by the nearest neighbour; at
+least 0.94 blurred by a pixel, 0.99 halved and enlarged, 0.52 enlarged by 1.5, 0.35 shrunk to 0.7, 0.40 halved by means.
+"""
 _NO_PIXELS = np.zeros(256, int)
 
 
@@ -81,6 +88,8 @@ class _Content:
     problems: list[Problem] = field(default_factory=list)
     pixels: np.ndarray = field(default_factory=lambda: _NO_PIXELS)
     """Number of pixels of each label [256]."""
+    steps: np.ndarray = field(default_factory=lambda: np.zeros(2, int))
+    """Of the labels, by `count_steps`."""
     silhouette: float | None = None
     """The part of the image inside the silhouette, if the frame has one."""
     left_out: int = 0
@@ -100,7 +109,7 @@ def _look(frame: Frame, parts: dict[int, str]) -> _Content:
             return None
 
     image = read(frame.image, read_image)
-    silhouette = read(frame.object_mask, read_mask)
+    silhouette = read(frame.object_mask, read_silhouette)
     if frame.object_mask is None and image is not None and image.shape[2] == 4 and not (image[..., 3] == 255).all():
         silhouette = image[..., 3]
     if silhouette is not None:
@@ -118,6 +127,7 @@ def _look(frame: Frame, parts: dict[int, str]) -> _Content:
     labels = read(frame.labels, read_labels)
     if labels is not None:
         content.pixels = np.bincount(labels.ravel(), minlength=256)
+        content.steps = count_steps(labels)
         if silhouette is not None:
             content.left_out = int(((labels > 0) & (labels != UNLABELLED) & (silhouette <= 127)).sum())
         unknown = [i for i in np.flatnonzero(content.pixels[:UNLABELLED]) if i > 0 and i not in parts]
@@ -185,6 +195,17 @@ def _check_silhouettes(capture: Capture, state: State, contents: list[_Content])
         yield Problem("error", capture.path / state.name, found, mend)
 
 
+def _check_steps(capture: Capture, state: State, contents: list[_Content]) -> Iterator[Problem]:
+    """A warning, as a frame around a window may be a thin rim between other ids, too."""
+    direct, blurred = np.sum([content.steps for content in contents], axis=0)
+    steps = direct + blurred
+    if steps >= _ENOUGH_STEPS and blurred > _BLURRED * steps:
+        found = f"the labels seem to be resized or anti-aliased: {blurred / steps:.0%} of the outlines between ids two"
+        found += " or more apart are rims of ids in between"
+        mend = "export them without anti-aliasing, and resize them by the nearest neighbour"
+        yield Problem("warning", capture.path / state.name, found, mend)
+
+
 def _check_points(state: State) -> Iterator[Problem]:
     if state.points is not None:
         try:
@@ -202,13 +223,15 @@ def _gaps(capture: Capture, contents: Sequence[_Content]) -> list[int]:
 
 
 def _gap_problem(capture: Capture, pixels: np.ndarray, gaps: Sequence[int]) -> Problem:
-    """An error unless all training frames are labelled, and two parts in two states, which are worth a fit."""
+    """An error unless all training frames are labelled, and two parts in two states, which are worth a fit that the
+    gaps do not more than double."""
     whole = all(frame.labels is not None for state in capture.states for frame in state.split("train"))
     compared = int(((pixels[:, 1:UNLABELLED] > 0).sum(axis=0) > 1).sum())
     missing = ", ".join(map(str, gaps[:3])) + (", ..." if len(gaps) > 3 else "")
     found = f"the labels go up to {max(capture.parts)}, but none is {missing}"
     mend = "number the parts 1, 2, ... without gaps, or correct stray pixels of large numbers"
-    return Problem("warning" if whole and compared > 1 else "error", capture.path, found, mend)
+    few = 2 * len(gaps) <= len(capture.parts)
+    return Problem("warning" if whole and few and compared > 1 else "error", capture.path, found, mend)
 
 
 def _check_labels(capture: Capture, pixels: np.ndarray) -> Iterator[Problem]:

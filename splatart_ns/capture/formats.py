@@ -319,13 +319,15 @@ def _splits(file: Path, meta: dict[str, Any], groups: Sequence[Sequence[str]], r
     if not any(f"{split}_filenames" in meta for split in SPLITS):
         return {name: "test" if i % 8 == 7 else "train" for names in groups for i, name in enumerate(names)}
     names = {name for group in groups for name in group}
+    by_path = {os.path.abspath(file.parent / name): name for name in names}
     listed: dict[str, set[str]] = {}
     for split in SPLITS:
         key = f"{split}_filenames"
         values = meta.get(key)
         if values is not None and not isinstance(values, list):
             raise CaptureError(file, f"{key} is {show(values)}", "write it as a list of file paths")
-        listed[split] = {relative_path(file, f"an entry of {key}", value) for value in values or []}
+        paths = {relative_path(file, f"an entry of {key}", value) for value in values or []}
+        listed[split] = (paths & names) | {by_path.get(os.path.abspath(file.parent / p), p) for p in paths - names}
         if unknown := sorted(listed[split] - names):
             message = f"{key} lists {unknown[0]!r}, which no frame has as its file_path"
             report(Problem("error", file, message, "correct the name or add the frame"))

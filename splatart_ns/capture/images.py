@@ -25,8 +25,11 @@ from splatart_ns.files import replacing
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
 _PNG_COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGBA"}
+_LABELS_MEND = "save the part ids themselves in one grey channel of 8 or 16 bits, without colours"
 _HALF = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])  # OpenCV's pixel centres lie at integers
 MAX_LABEL = UNLABELLED - 1
+_WHITE = 250
+"""Of 255; an object that soft edges leave darker is no wider than a pixel."""
 _MOST_BYTES, _MOST_PIXELS = 1 << 30, 1 << 27
 
 
@@ -42,19 +45,22 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def read_labels(path: Path) -> np.ndarray:
-    """Part ids, uint8 [H, W]: 0 background, 1..254 parts, 255 unlabelled; from a one-channel PNG of 8 or 16 bits."""
+    """Part ids, uint8 [H, W]: 0 background, 1..254 parts, 255 unlabelled; from a PNG of 8 or 16 bits.
+
+    They are the indices of a palette, as annotation tools write them, else the grey of one channel or of three.
+    """
     data = read_bytes(path)
     if not data.startswith(_PNG) or len(data) < 33:
         raise CaptureError(path, "labels are not a PNG file", "save the part ids as a one-channel 8- or 16-bit PNG")
     bits, colour_type = data[24], data[25]
-    if colour_type != 0 or bits < 8:
-        kind = _PNG_COLOUR_TYPES.get(colour_type, f"colour type {colour_type}")
-        raise CaptureError(
-            path,
-            f"labels are a {bits}-bit {kind} PNG",
-            "save the part ids themselves in one grey channel of 8 or 16 bits, without colours",
-        )
+    kind = _PNG_COLOUR_TYPES.get(colour_type, f"colour type {colour_type}")
     labels = _decode(path, data)
+    if kind == "palette":
+        labels = _palette_indices(path, data, labels)
+    elif kind == "RGB" and (labels == labels[..., :1]).all():
+        labels = np.ascontiguousarray(labels[..., 0])
+    elif kind != "grey" or bits < 8:
+        raise CaptureError(path, f"labels are a {bits}-bit {kind} PNG", _LABELS_MEND)
     if labels.dtype == np.uint16:
         if labels.max(initial=0) > UNLABELLED:
             raise CaptureError(
@@ -67,15 +73,25 @@ def read_labels(path: Path) -> np.ndarray:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """A silhouette or a mask, uint8 [H, W], 0 outside and 255 inside; masks of 0 and 1 are stretched to 0 and 255."""
-    mask = _decode(path, read_bytes(path))
-    if mask.dtype != np.uint16 or mask.max(initial=0) > 1:
-        mask = _to_bytes(path, mask)
-    if mask.ndim == 3:
-        if not (mask[..., :1] == mask[..., :3]).all():
-            raise CaptureError(path, "the mask is a colour image", "save it with one grey channel")
-        mask = np.ascontiguousarray(mask[..., 0])
-    return (mask * 255).astype(np.uint8) if mask.max(initial=0) <= 1 else mask
+    """The pixels that count, uint8 [H, W]: 255 where the file is not 0, as in nerfstudio, else 0."""
+    return np.where(_mask_channel(path), np.uint8(255), np.uint8(0))
+
+
+def read_silhouette(path: Path) -> np.ndarray:
+    """How much of each pixel an object covers, uint8 [H, W], 255 for all of it.
+
+    A file without white holds 0 and one other value, which is stretched to 255, so that no object is half transparent.
+    """
+    pixels = _mask_channel(path)
+    silhouette = _to_bytes(path, pixels)
+    if silhouette.max(initial=0) >= _WHITE:
+        return silhouette
+    values = np.unique(pixels).tolist()
+    if len({*values} - {0}) > 1:
+        told = values if len(values) <= 5 else [*values[:3], "...", values[-1]]
+        found = f"the mask is nowhere white: its values are {', '.join(map(str, told))}"
+        raise CaptureError(path, found, "write 255 where the object is and 0 elsewhere")
+    return np.where(pixels, np.uint8(255), np.uint8(0))
 
 
 def read_depth(path: Path, unit: float = 1e-3) -> np.ndarray:
@@ -240,7 +256,8 @@ def downscale_labels(labels: np.ndarray, factor: int) -> np.ndarray:
 def read_bytes(path: Path, size: int = _MOST_BYTES + 1) -> bytes:
     """The first `size` bytes of a file, or all of at most 1 GiB."""
     if not os.path.isfile(path):
-        raise CaptureError(path, "the file does not exist", "add it or correct its path")
+        mend = "write / for \\ in its path" if "\\" in path.name else "add it or correct its path"
+        raise CaptureError(path, "the file does not exist", mend)
     try:
         with open(path, "rb") as file:
             data = file.read(size)
@@ -271,6 +288,35 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
     if pixels is None:
         raise CaptureError(path, "the image is cut off, damaged or of an unknown kind", "copy or export it again")
     return pixels
+
+
+def _palette_indices(path: Path, data: bytes, shown: np.ndarray) -> np.ndarray:
+    """The indices [H, W] of a PNG whose colours `shown` [H, W, 3 or 4] come from a palette."""
+    try:
+        with PIL.Image.open(io.BytesIO(data)) as image:
+            indices, palette = np.array(image), np.reshape(image.getpalette(), (-1, 3))
+    except Exception:  # Pillow lets whatever its parsers meet through
+        raise CaptureError(path, "the palette is damaged", "export the labels again") from None
+    # Programs that shrink files give greys a palette, too, in an order of their own.
+    if (palette == palette[:, :1]).all() and (shown[..., 0] != indices).any():
+        raise CaptureError(path, "labels are a palette PNG of greys that are not their indices", _LABELS_MEND)
+    return indices
+
+
+def _mask_channel(path: Path) -> np.ndarray:
+    """The channel [H, W] that holds a mask: the grey, or the alpha where it varies and the colour does not."""
+    pixels = _decode(path, read_bytes(path))
+    if pixels.ndim == 2:
+        return pixels
+    colour, alpha = pixels[..., :3], pixels[..., -1]
+    if pixels.shape[2] == 4 and np.ptp(alpha) > 0:
+        shown = colour[alpha > 0]
+        if (shown != shown[0]).any():
+            raise CaptureError(path, "the mask has colours and an alpha channel", "save it with one grey channel")
+        return np.ascontiguousarray(alpha)
+    if not (colour == colour[..., :1]).all():
+        raise CaptureError(path, "the mask is a colour image", "save it with one grey channel")
+    return np.ascontiguousarray(colour[..., 0])
 
 
 def _to_bytes(path: Path, pixels: np.ndarray) -> np.ndarray:

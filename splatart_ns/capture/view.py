@@ -21,6 +21,7 @@ from splatart_ns.capture.images import (
     read_image,
     read_labels,
     read_mask,
+    read_silhouette,
     read_sized,
     undistort,
     undistort_labels,
@@ -128,7 +129,7 @@ def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) ->
     if image.shape[2] == 4 and not (image[..., 3] == 255).all():
         alpha = torch.from_numpy(np.ascontiguousarray(image[..., 3]))
     if frame.object_mask is not None:
-        silhouette = read(frame.object_mask, read_mask)
+        silhouette = read(frame.object_mask, read_silhouette)
         if alpha is None:
             alpha = torch.from_numpy(silhouette)
         else:  # a mask is hard where the alpha is soft: leave the pixels along its edge to the alpha
@@ -137,7 +138,7 @@ def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) ->
         ids = undistort_labels(read_sized(frame.labels, read_labels, distorted), distorted)
         labels = torch.from_numpy(downscale_labels(ids, downscale))
     if frame.mask is not None:
-        mask = torch.from_numpy(read(frame.mask, lambda path: np.where(read_mask(path), np.uint8(255), 0)) > 127)
+        mask = torch.from_numpy(read(frame.mask, read_mask) > 127)
     if frame.depth is not None:
         measured = read_depth_for(frame.depth, distorted, normalization.scale * frame.depth_unit)
         depth = torch.from_numpy(downscale_labels(undistort_labels(measured, distorted, unknown=0), downscale))

@@ -47,7 +47,7 @@ def test_every_frame_is_looked_at_and_every_problem_told(capture_folder):
     put(state / "images/0002.png", np.zeros((8, 16, 3), np.uint8))
     put(state / "labels/0002.png", np.zeros((8, 8), np.uint8))
     put(state / "labels/0003.png", np.full((16, 16), 9, np.uint8))
-    put(capture_folder / "state_01/labels/0007.png", np.zeros((16, 16, 3), np.uint8))
+    put(capture_folder / "state_01/labels/0007.png", np.full((16, 16, 3), [0, 0, 1], np.uint8))
     assert found(check_capture(capture_folder)) == [
         "0000.png: the file does not exist",
         "0001.png: the image is cut off, damaged or of an unknown kind",
@@ -105,6 +105,12 @@ def test_a_folder_that_cannot_be_read_is_named(capture_folder, monkeypatch):
     assert problem.file == capture_folder / "state_00" and "cannot be read" in problem.message
 
 
+def test_the_mend_of_a_windows_path_is_its_slashes(capture_folder, edit):
+    edit(capture_folder / FILE, lambda m: m["frames"][0].update(semantics_path="labels\\0000.png"))
+    (problem,) = check_capture(capture_folder)
+    assert problem.message == "the file does not exist" and problem.mend == "write / for \\ in its path"
+
+
 def test_a_broken_state_leaves_the_other_checked(capture_folder):
     (capture_folder / FILE).write_text("{")
     (capture_folder / "state_01/images/0000.png").unlink()
@@ -151,6 +157,12 @@ def test_inverted_silhouettes_are_an_error_where_labels_tell(capture_folder, edi
     assert found(check_capture(capture_folder)) == [
         "state_01: the silhouettes leave out 100% of what is labelled as parts"
     ]
+
+
+def test_an_object_mask_of_part_ids_is_an_error(capture_folder, edit):
+    edit(capture_folder / FILE, lambda m: [e.update(object_mask_path=e["semantics_path"]) for e in m["frames"][:2]])
+    told = "the mask is nowhere white: its values are 0, 1, 2"
+    assert found(check_capture(capture_folder)) == [f"0000.png: {told}", f"0001.png: {told}"]
 
 
 def test_opaque_images_are_told_from_silhouettes(capture_folder, edit):
@@ -215,14 +227,25 @@ def test_one_image_cannot_show_two_states(capture_folder, edit):
 
 def test_numbers_that_labels_without_classes_leave_out_are_one_problem(capture_folder, edit):
     for k in range(2):
-        relabel(capture_folder / f"state_0{k}", 2, 200)
+        relabel(capture_folder / f"state_0{k}", 2, 4)
+        relabel(capture_folder / f"state_0{k}", 1, 2)
         edit(capture_folder / f"state_0{k}/transforms.json", lambda m: m.pop("semantic_classes"))
-    told = ["capture: the labels go up to 200, but none is 2, 3, 4, ..."]
+    told = ["capture: the labels go up to 4, but none is 1, 3"]
     problems = check_capture(capture_folder)
     assert (found(problems), found(problems, "warning")) == ([], told)
 
     edit(capture_folder / "state_01/transforms.json", lambda m: m["frames"][0].pop("semantics_path"))
     assert found(check_capture(capture_folder)) == told  # that frame may show them
+
+
+def test_more_gaps_than_numbers_are_an_error(capture_folder, edit):
+    for k in range(2):
+        relabel(capture_folder / f"state_0{k}", 1, 80)
+        relabel(capture_folder / f"state_0{k}", 2, 160)
+        edit(capture_folder / f"state_0{k}/transforms.json", lambda m: m.pop("semantic_classes"))
+    (problem,) = check_capture(capture_folder)
+    assert problem.severity == "error" and "up to 160, but none is 1, 2, 3, ..." in problem.message
+    assert problem.mend.startswith("number the parts 1, 2, ... without gaps")
 
 
 def test_no_labels_at_all_is_one_error(capture_folder):

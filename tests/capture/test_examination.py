@@ -79,6 +79,10 @@ DEFECTS = {
         lambda c: change_all(c / "state_01/semantics", lambda labels: cv2.dilate(labels, np.ones((5, 5), np.uint8))),
         {"state_01": "the outlines of labels and silhouettes lie"},
     ),
+    "labels resized with interpolation": (
+        lambda c: change_all(c / "state_01/semantics", lambda labels: cv2.blur(labels, (2, 2))),
+        {"state_01": "the labels seem to be resized or anti-aliased"},
+    ),
     "a part labelled in one frame": (
         lambda c: [change_png(f, labelled_once) for f in sorted((c / "state_01/semantics").iterdir())[1:]],
         {"state_01": "part 2 (lid) is seen in 1 labelled training frame"},

@@ -106,6 +106,22 @@ def test_frames_outside_the_lists_are_left_out_and_train_comes_first(capture_fol
     }
 
 
+@pytest.mark.parametrize("key", ["file_path", "filenames"])
+def test_splits_may_list_frames_by_another_path_to_their_file(capture_folder, edit, key):
+    splits = {f.image: f.split for f in load_capture(capture_folder).states[0].frames}
+
+    def change(meta):
+        if key == "file_path":
+            for frame in meta["frames"]:
+                frame["file_path"] = str(capture_folder / "state_00" / frame["file_path"])
+        else:
+            for split in ("train", "val", "test"):
+                meta[f"{split}_filenames"] = [f"images/../{name}" for name in meta[f"{split}_filenames"]]
+
+    edit(capture_folder / FILE, change)
+    assert {f.image: f.split for f in load_capture(capture_folder).states[0].frames} == splits
+
+
 def test_a_frames_intrinsics_come_before_the_files(capture_folder, edit):
     edit(capture_folder / FILE, lambda m: m["frames"][0].update(fl_x=30.0, k1=0.01))
     first, second = load_capture(capture_folder).states[0].frames[:2]

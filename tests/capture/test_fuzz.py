@@ -8,6 +8,7 @@ import zlib
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 import trimesh
 from fuzzing import damaged_bytes, damaged_json, fuzzed, one_sentence
@@ -20,7 +21,7 @@ from splatart_ns.capture.capture import Normalization
 from splatart_ns.capture.check import check_capture
 from splatart_ns.capture.examination import examine
 from splatart_ns.capture.formats import load_capture
-from splatart_ns.capture.images import image_size, read_depth, read_image, read_labels, read_mask
+from splatart_ns.capture.images import image_size, read_depth, read_image, read_labels, read_mask, read_silhouette
 from splatart_ns.capture.label_import import import_labels
 from splatart_ns.capture.view import load_points
 from splatart_ns.errors import InputError
@@ -30,6 +31,14 @@ RNG = np.random.default_rng(0)
 
 def encoded(suffix, pixels):
     return cv2.imencode(suffix, pixels)[1].tobytes()
+
+
+def palette_png():
+    image = PIL.Image.fromarray(RNG.integers(0, 4, (9, 7), np.uint8), mode="P")
+    image.putpalette(list(range(12)))
+    file = io.BytesIO()
+    image.save(file, "png")
+    return file.getvalue()
 
 
 def saved(array):
@@ -51,7 +60,7 @@ IMAGES = [
     encoded(".tiff", pixels(9, 7, dtype=np.float32)),
     encoded(".bmp", pixels(9, 7, 3)),
 ]
-LABELS = [encoded(".png", pixels(9, 7)), encoded(".png", pixels(9, 7, dtype=np.uint16)), *IMAGES[:1]]
+LABELS = [encoded(".png", pixels(9, 7)), encoded(".png", pixels(9, 7, dtype=np.uint16)), *IMAGES[:1], palette_png()]
 DEPTHS = [saved(RNG.random((9, 7))), saved(RNG.random((9, 7, 1)).astype(np.float32)), LABELS[1]]
 POINTS = [
     trimesh.PointCloud(RNG.random((20, 3)), colors=pixels(20, 4)).export(file_type="ply", encoding=encoding)
@@ -64,9 +73,10 @@ POINTS = [
 def test_any_image(tmp_path, data):
     file = tmp_path / "image.png"
     file.write_bytes(data)
-    image, mask = one_sentence(read_image, file), one_sentence(read_mask, file)
+    image = one_sentence(read_image, file)
     assert image is None or (image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] in (3, 4))
-    assert mask is None or (mask.dtype == np.uint8 and mask.ndim == 2)
+    for mask in (one_sentence(read_mask, file), one_sentence(read_silhouette, file)):
+        assert mask is None or (mask.dtype == np.uint8 and mask.ndim == 2)
     one_sentence(image_size, file)
 
 
@@ -194,7 +204,7 @@ def bomb(width, height):
     )
 
 
-@pytest.mark.parametrize("reader", [read_image, read_labels, read_mask, read_depth])
+@pytest.mark.parametrize("reader", [read_image, read_labels, read_mask, read_silhouette, read_depth])
 @pytest.mark.parametrize("size", [(60_000, 60_000), (12_000, 12_000), (2**31 - 1, 2**31 - 1)])
 def test_an_image_that_promises_too_many_pixels_is_not_decoded(tmp_path, monkeypatch, reader, size):
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))

@@ -14,6 +14,7 @@ from splatart_ns.capture.images import (
     read_image,
     read_labels,
     read_mask,
+    read_silhouette,
     read_sized,
     undistort,
     undistort_labels,
@@ -64,7 +65,7 @@ def test_a_cut_off_image_is_an_input_error(tmp_path, suffix, keep):
 def test_a_missing_file_a_folder_and_a_stranger_are_input_errors(tmp_path):
     (tmp_path / "text.png").write_text("no image")
     for name in ("nothing.png", ".", "text.png"):
-        for reader in (read_image, read_labels, read_mask, read_depth, image_size):
+        for reader in (read_image, read_labels, read_mask, read_silhouette, read_depth, image_size):
             with pytest.raises(InputError):
                 reader(tmp_path / name)
 
@@ -81,33 +82,96 @@ def test_labels_above_254_are_an_input_error(tmp_path):
         read_labels(write(tmp_path / "a.png", np.array([[0, 300]], np.uint16)))
 
 
-def test_coloured_palette_lossy_and_one_bit_labels_are_input_errors(tmp_path):
+def write_palette(path, ids, colours):
+    image = Image.fromarray(np.array(ids, np.uint8), mode="P")
+    image.putpalette(np.ravel(colours).astype(np.uint8).tolist())
+    image.save(path)
+    return path
+
+
+@pytest.mark.parametrize("largest", [1, 3, 15, 254])
+def test_labels_are_the_indices_of_a_palette(tmp_path, largest):
+    ids = [[0, 1, largest]]
+    assert read_labels(write_palette(tmp_path / "a.png", ids, RNG.integers(0, 256, (largest + 1, 3)))).tolist() == ids
+    assert read_labels(write_palette(tmp_path / "b.png", ids, np.arange(768) // 3)).tolist() == ids
+
+
+def test_greys_of_a_palette_that_are_not_its_indices_are_an_input_error(tmp_path):
+    """A program that shrinks files leaves labels of 0, 2 and 3 so."""
+    path = write_palette(tmp_path / "a.png", [[0, 1, 2]], np.repeat([0, 2, 3], 3))
+    with pytest.raises(InputError, match="greys that are not their indices; save the part ids"):
+        read_labels(path)
+
+
+def test_three_equal_channels_are_labels(tmp_path):
+    ids = np.array([[0, 1], [2, 255]], np.uint8)
+    for dtype in (np.uint8, np.uint16):
+        path = write(tmp_path / "a.png", np.repeat(ids[..., None], 3, axis=2).astype(dtype))
+        assert read_labels(path).tolist() == ids.tolist()
+
+
+def test_coloured_lossy_and_one_bit_labels_are_input_errors(tmp_path):
     ids = np.array([[0, 1], [2, 3]], np.uint8)
-    colour = write(tmp_path / "colour.png", np.repeat(ids[..., None], 3, axis=2))
-    palette = Image.fromarray(ids, mode="P")
-    palette.putpalette(list(range(256)) * 3)
-    palette.save(tmp_path / "palette.png")
+    colour = write(tmp_path / "colour.png", np.stack([ids, ids, 0 * ids], axis=2))
     Image.fromarray(ids > 0).save(tmp_path / "bits.png")
     jpeg = write(tmp_path / "lossy.jpg", ids)
-    for path, word in ((colour, "RGB"), (tmp_path / "palette.png", "palette"), (tmp_path / "bits.png", "1-bit")):
+    for path, word in ((colour, "RGB"), (tmp_path / "bits.png", "1-bit")):
         with pytest.raises(InputError, match=word):
             read_labels(path)
     with pytest.raises(InputError, match="not a PNG"):
         read_labels(jpeg)
 
 
-def test_masks_of_zero_and_one_are_stretched(tmp_path):
-    binary = np.array([[0, 1]], np.uint8)
-    assert read_mask(write(tmp_path / "a.png", binary)).tolist() == [[0, 255]]
-    assert read_mask(write(tmp_path / "d.png", binary.astype(np.uint16))).tolist() == [[0, 255]]
-    assert read_mask(write(tmp_path / "e.png", binary.astype(np.uint16) * 65535)).tolist() == [[0, 255]]
-    assert read_mask(write(tmp_path / "b.png", np.array([[0, 90]], np.uint8))).tolist() == [[0, 90]]
-    assert read_mask(write(tmp_path / "c.png", np.repeat(binary[..., None] * 255, 3, axis=2))).tolist() == [[0, 255]]
+@pytest.mark.parametrize("inside", [1, 3, 90, 128, 255])
+def test_masks_of_zero_and_another_value_are_stretched(tmp_path, inside):
+    mask = np.array([[0, inside]], np.uint8)
+    deep = mask.astype(np.uint16)
+    for pixels in (mask, deep, deep * 257, np.repeat(mask[..., None], 3, axis=2)):
+        for reader in (read_mask, read_silhouette):
+            assert reader(write(tmp_path / "a.png", pixels)).tolist() == [[0, 255]]
+
+
+def test_silhouettes_keep_their_soft_edges_and_masks_do_not(tmp_path):
+    soft = write(tmp_path / "a.png", np.array([[0, 90, 255]], np.uint8))
+    assert read_silhouette(soft).tolist() == [[0, 90, 255]]
+    assert read_mask(soft).tolist() == [[0, 255, 255]]
+
+
+@pytest.mark.parametrize(("values", "told"), [([0, 1, 2, 3], "0, 1, 2, 3"), (range(9), "0, 1, 2, ..., 8")])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_silhouette_without_white_is_refused_with_its_values(tmp_path, values, told, dtype):
+    path = write(tmp_path / "a.png", np.array([values], dtype))
+    with pytest.raises(InputError, match=f"its values are {told}; write 255 where the object is"):
+        read_silhouette(path)
+    assert read_mask(path).tolist() == [[0] + [255] * (len(values) - 1)]  # what is not 0 counts
 
 
 def test_a_coloured_mask_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="one grey channel"):
-        read_mask(write(tmp_path / "a.png", np.array([[[0, 0, 200]]], np.uint8)))
+        read_silhouette(write(tmp_path / "a.png", np.array([[[0, 0, 200]]], np.uint8)))
+
+
+@pytest.mark.parametrize("shown", [0, 200, 255])
+@pytest.mark.parametrize("hidden", [0, 255])
+def test_a_mask_of_one_colour_has_its_shape_in_the_alpha(tmp_path, shown, hidden):
+    alpha = np.array([[0, 100, 255]], np.uint8)
+    grey = np.where(alpha > 0, shown, hidden).astype(np.uint8)
+    Image.fromarray(np.stack([grey, alpha], axis=-1), mode="LA").save(tmp_path / "la.png")
+    write(tmp_path / "rgba.png", np.stack([grey, grey, grey, alpha], axis=-1))
+    for file in ("la.png", "rgba.png"):
+        assert read_silhouette(tmp_path / file).tolist() == [[0, 100, 255]]
+
+
+def test_an_alpha_that_is_the_same_everywhere_says_nothing_of_a_mask(tmp_path):
+    for alpha in (0, 255):
+        mask = np.array([[[0, 0, 0, alpha], [255, 255, 255, alpha]]], np.uint8)
+        assert read_silhouette(write(tmp_path / "a.png", mask)).tolist() == [[0, 255]]
+
+
+def test_a_mask_of_which_colour_and_alpha_differ_is_refused(tmp_path):
+    mask = np.array([[[0, 0, 0, 255], [255, 255, 255, 255], [0, 0, 0, 0]]], np.uint8)
+    with pytest.raises(InputError, match="colours and an alpha channel; save it with one grey channel"):
+        read_silhouette(write(tmp_path / "a.png", mask))
 
 
 def test_depth_is_in_millimetres_in_both_forms(tmp_path):

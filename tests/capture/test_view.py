@@ -102,6 +102,13 @@ def test_an_image_whose_alpha_says_nothing_is_opaque(capture_folder, edit):
     assert (load_views(load_capture(capture_folder), 0)[0].alpha > 0).tolist() == np.eye(16, dtype=bool).tolist()
 
 
+def test_an_object_whose_mask_is_grey_is_opaque(capture_folder, edit):
+    cv2.imwrite(str(capture_folder / "state_00/images/0000.png"), np.full((16, 16, 3), 200, np.uint8))
+    cv2.imwrite(str(capture_folder / "state_00/o.png"), np.eye(16, dtype=np.uint8) * 128)
+    edit(capture_folder / FILE, lambda m: m["frames"][0].update(object_mask_path="o.png"))
+    assert load_views(load_capture(capture_folder), 0)[0].alpha.tolist() == (255 * np.eye(16)).tolist()
+
+
 def test_the_image_is_composited_on_a_background(capture_folder):
     view = load_views(load_capture(capture_folder), 0)[0]
     background = torch.tensor([0.0, 0.5, 1.0])
