@@ -25,6 +25,7 @@ from splatart_ns.stages.surroundings import surrounding_points
 NEARLY = 0.005
 """A scale factor is 1 / n if its n-fold is so near 1: 0.333 is 1 / 3."""
 LEAST_SCALE = 0.001
+"""Smaller images would have no pixels to speak of."""
 
 
 class CaptureDataset(InputDataset):

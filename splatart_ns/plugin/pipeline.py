@@ -16,7 +16,7 @@ class StagePipeline(VanillaPipeline):
         """Take over a checkpoint, to look at it.
 
         Raises:
-            InputError: to train on from there, and nerfstudio's optimizers would go on with other tensors.
+            InputError: in training; nerfstudio's optimizers would go on with the tensors that they had before.
         """
         if self.datamanager.test_mode == "val":  # as the Trainer alone has it
             raise InputError(
