@@ -227,6 +227,7 @@ def test_cameras_of_images_without_silhouettes_move_if_that_is_by_pixels(
 ):
     pipeline = semantic_trainer(opaque_capture_dir, steps=301, semantic_start=300).pipeline
     given = pipeline.model.viewmats.clone()
+    assert pipeline.datamanager.cached_train  # is loaded, and the cameras with it
 
     def shifted(splat, views, given, compared):
         found = given.clone()
