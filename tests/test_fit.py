@@ -211,6 +211,21 @@ def test_a_draft_looks_at_smaller_images_where_enough_of_them_is_left(hinge_capt
             assert config.pipeline.datamanager.camera_res_scale_factor == 1 / expected
 
 
+def test_a_fit_says_first_what_check_warns_of(hinge_capture, tmp_path, monkeypatch, capsys):
+    from splatart_ns.plugin import fit as fits
+
+    capture = shutil.copytree(hinge_capture, tmp_path / "capture")
+    for file in capture.glob("state_*/semantics/*.png"):
+        labels = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(file), cv2.blur(labels, (2, 2)))
+    monkeypatch.setattr(fits, "_train", lambda *_, **__: None)
+    monkeypatch.setattr(fits, "MOST_WARNINGS", 1)
+    fits.fit(capture, tmp_path / "bundle")
+    told = " ".join(capsys.readouterr().out.split())
+    assert told.count("Warning: ") == 1 and "seem to be resized or anti-aliased" in told
+    assert "And 1 more warnings, see `splatart check" in told
+
+
 class TestResuming:
     """What of an earlier run counts."""
 

@@ -27,13 +27,18 @@ def check_capture(path: Path | str) -> list[Problem]:
     return check_structure(Path(path))[1]
 
 
-def require_valid(path: Path | str) -> Capture:
-    """Load and check a capture. Raises `InputError` with the first error, and how many there are."""
+def require_valid(path: Path | str, warn: Callable[[Problem], None] | None = None) -> Capture:
+    """Load and check a capture. Raises `InputError` with the first error, and how many there are.
+
+    `warn` is called with each problem that is none.
+    """
     capture, problems = check_structure(Path(path))
     errors = [p for p in problems if p.severity == "error"]
     if errors or capture is None:
         more = f" (and {len(errors) - 1} more, see `splatart check {path}`)" if len(errors) > 1 else ""
         raise InputError(f"{errors[0]}{more}.")
+    for problem in problems if warn is not None else ():
+        warn(problem)
     return capture
 
 

@@ -6,7 +6,7 @@ import copy
 import platform
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -21,7 +21,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 
 from splatart_ns.bundle import load_bundle
 from splatart_ns.bundle.folder import ARTICULATION, remove_bundle
-from splatart_ns.capture.capture import Capture, Worlds
+from splatart_ns.capture.capture import Capture, Problem, Worlds
 from splatart_ns.capture.check import require_valid
 from splatart_ns.capture.digest import capture_digest
 from splatart_ns.capture.values import is_inside
@@ -66,6 +66,8 @@ EFFORTS: dict[Quality, Effort] = {
 }
 SMALLEST = 128
 """Along the shorter side of images that are made smaller."""
+MOST_WARNINGS = 3
+"""So many of the capture are said before a fit."""
 
 
 _REPORT = {"stages": [{"name": str, "seconds": NUMBER}], "settings": dict}
@@ -194,7 +196,8 @@ def fit(
     """
     set_backend(rasterizer)
     settings = Settings(quality, root, seed, rasterizer, list(joints), worlds, refine_cameras)
-    capture = require_fittable(capture_path, settings)
+    warnings: list[Problem] = []
+    capture = require_fittable(capture_path, settings, warnings.append)
     folders = {capture_path / s.name for s in capture.states}
     folders |= {frame.image.parent for s in capture.states for frame in s.frames} - {capture_path}
     if is_inside(output_dir, capture_path) or any(is_inside(folder, output_dir) for folder in folders):
@@ -209,6 +212,10 @@ def fit(
     except OSError as error:
         raise InputError(f"{output_dir} cannot be written ({error.strerror}); choose another --output-dir.") from None
 
+    for warning in warnings[:MOST_WARNINGS]:
+        CONSOLE.log(f"Warning: {warning}.", markup=False)
+    if more := len(warnings[MOST_WARNINGS:]):
+        CONSOLE.log(f"And {more} more warnings, see `splatart check {capture_path}`.", markup=False)
     configs = stage_configs(capture, output_dir, settings)
     pose, joint = (configs.pop(name) for name in ("pose", "joint"))
     with kernel_threads(num_cores()), _progress() as progress:
@@ -218,13 +225,13 @@ def fit(
     return output_dir
 
 
-def require_fittable(capture_path: Path, settings: Settings) -> Capture:
-    """Load and check a capture, and the settings that are about it.
+def require_fittable(capture_path: Path, settings: Settings, warn: Callable[[Problem], None] | None = None) -> Capture:
+    """Load and check a capture, and the settings that are about it; `warn` as in `require_valid`.
 
     Raises:
         InputError: for a capture, a root, a joint or a seed that cannot be used.
     """
-    capture, root = require_valid(capture_path), settings.root
+    capture, root = require_valid(capture_path, warn), settings.root
     if settings.worlds is None:
         require_one_place(capture)
     if root is not None and root not in capture.parts.values():
