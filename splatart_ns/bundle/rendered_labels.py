@@ -13,6 +13,7 @@ from torch import Tensor
 
 from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.posing import moved_splat, normalized, observed_motions, part_features
+from splatart_ns.bundle.vantage import in_canonical_world
 from splatart_ns.capture.capture import UNLABELLED, Camera, Capture, Frame, Normalization
 from splatart_ns.capture.images import read_image, read_sized, undistorted_points, write_png
 from splatart_ns.capture.mask_export import mask_path, write_mask_classes
@@ -55,6 +56,7 @@ def write_labels(
         raise InputError(
             f"{capture.path}: has other states or parts than the bundle; give the capture it was fitted to."
         )
+    capture = in_canonical_world(capture, bundle)
     ids = torch.tensor([0, *(part.id for part in bundle.parts)])
     features, colours = part_features(bundle).to(device), part_colours(max(capture.parts)).numpy()
     done = []

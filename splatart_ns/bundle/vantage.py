@@ -35,6 +35,11 @@ def vantage_points(capture: Capture, worlds: np.ndarray) -> list[list[list[float
     return points
 
 
+def in_canonical_world(capture: Capture, bundle: Bundle) -> Capture:
+    """The capture that a bundle was fitted to, with the worlds of its states brought into the canonical one."""
+    return in_one_world(capture, bundle.provenance["worlds"]) if "worlds" in bundle.provenance else capture
+
+
 def cameras_around(bundle: Bundle, part: Part) -> Tensor | None:
     """Where the cameras of all states were as seen from a part [N, 3] float64, in the canonical frame.
 

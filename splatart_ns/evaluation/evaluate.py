@@ -11,10 +11,10 @@ import torch
 from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.folder import ARTICULATION, METRICS, load_bundle
 from splatart_ns.bundle.posing import observed_motions
+from splatart_ns.bundle.vantage import in_canonical_world
 from splatart_ns.capture.capture import Capture, State
 from splatart_ns.capture.formats import load_capture, load_novel
 from splatart_ns.capture.view import load_views
-from splatart_ns.capture.worlds import in_one_world
 from splatart_ns.errors import InputError
 from splatart_ns.evaluation.geometry import chamfer_centres, chamfer_mesh
 from splatart_ns.evaluation.ground_truth import GroundTruth, load_ground_truth
@@ -46,8 +46,7 @@ def evaluate(bundle_folder: Path, capture_path: Path, device: torch.device | str
             f"{capture_path}: has other parts than {bundle_folder / ARTICULATION}; evaluate a bundle on the capture "
             "that it was fitted to"
         )
-    if "worlds" in bundle.provenance:
-        capture = in_one_world(capture, bundle.provenance["worlds"])
+    capture = in_canonical_world(capture, bundle)
     truth = load_ground_truth(capture_path)
     notes = ["images.lpips: its network's weights are not part of this package"]
     metrics: dict[str, Any] = {

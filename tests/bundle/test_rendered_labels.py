@@ -49,6 +49,24 @@ def test_unlabelled_frames_get_the_parts_they_show_and_import_takes_them(
     assert len(overlays) == 24 and cv2.imread(str(overlays[0])).shape == (64, 64, 3)
 
 
+def test_states_with_worlds_of_their_own_have_the_same_labels(hinge_fit, sparse_capture, tmp_path):
+    bundle = load_bundle(hinge_fit)
+    write_labels(bundle, load_capture(sparse_capture), tmp_path / "shared")
+    world = np.array([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
+    file = sparse_capture / "state_01/transforms.json"
+    meta = json.loads(file.read_text())
+    for frame in meta["frames"]:
+        T = world @ np.array(frame["transform_matrix"])
+        T[:3, :3] /= 2
+        frame["transform_matrix"] = T.tolist()
+    file.write_text(json.dumps(meta))
+    bundle.provenance["worlds"] = [np.eye(4).tolist(), np.linalg.inv(world).tolist()]
+    write_labels(bundle, load_capture(sparse_capture), tmp_path / "own")
+    for expected in (tmp_path / "shared/labels").rglob("*.png"):
+        found = tmp_path / "own/labels" / expected.relative_to(tmp_path / "shared/labels")
+        assert (read_labels(found) == read_labels(expected)).mean() > 0.999
+
+
 def test_a_labelled_capture_and_another_capture_are_refused(hinge_fit, hinge_capture, sparse_capture, tmp_path):
     bundle = load_bundle(hinge_fit)
     with pytest.raises(InputError, match="every frame is labelled"):
