@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.view import View
-from splatart_ns.geometry.se3 import so3_log
+from splatart_ns.geometry.se3 import inverse, so3_log
 from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_of, similarity, view_of_moved
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.flush import is_flush
@@ -20,7 +20,11 @@ from splatart_ns.stages.part_pair import IN_EVEN_LIGHT, part_pair
 from splatart_ns.stages.pose_evidence import ALL_VIEWS, MAX_ITERATIONS
 from splatart_ns.stages.refinement import motion_covariance, refine
 from splatart_ns.stages.registration import MIN_POINTS, part_points
-from splatart_ns.stages.render_choice import COARSE_PIXELS, FINE_PIXELS, SUSPECT, VIEWS, initial_motion
+from splatart_ns.stages.render_choice import COARSE_PIXELS, FINE_PIXELS, OTHERWISE, SUSPECT, VIEWS, initial_motion
+
+ALIKE = 1.05
+"""A quite other turn that fits less than this many times worse may be the right one. Of a box's body, refined, the
+right one fits 1.04 times worse than each state's own Gaussians, three others by which it looked alike 1.16 and 1.17."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,8 @@ class WorldFit:
     logarithm of the scale (0 where it was given); see `motion_covariance`."""
     ratio: float
     """How much worse the part's images fit than with each state's own Gaussians."""
+    doubtful: bool = False
+    """Whether they fit hardly worse after a quite other turn."""
 
 
 def fit_world(
@@ -47,9 +53,9 @@ def fit_world(
     """The similarity, or the rigid motion, of another state's world to that of state 0 under which `part` rests.
 
     Many-start registration chosen by rendering, after the part is given the radius that it has in state 0, and then
-    Gauss-Newton on images for all seven unknowns: on few pixels, on many and, unless the part lies flush with others,
-    once more without haze (see `free_space`), which made a pair of scissors .1 % too small. None where the images show
-    too little of the part.
+    Gauss-Newton on images for all seven unknowns, from every motion by which it looks alike: on few pixels, on many
+    and, unless the part lies flush with others, once more without haze (see `free_space`), which made a pair of
+    scissors .1 % too small. None where the images show too little of the part.
 
     Args:
         splats: The labelled splats of state 0 and of the other state, each in its own world.
@@ -60,15 +66,32 @@ def fit_world(
     if min(len(p.xyz) for p in points) < MIN_POINTS:
         return None
     factor = points[0].radius / points[1].radius if with_scale else 1.0
-    world = similarity(factor, torch.eye(3), torch.zeros(3))
+    zoom = similarity(factor, torch.eye(3), torch.zeros(3))
     zoomed = splats[0], splats[1].scaled(factor)
-    zoomed_views = views[0], moved_views(views[1], world)
+    zoomed_views = views[0], moved_views(views[1], zoom)
     start = initial_motion(zoomed, zoomed_views, seen, part, seed)
     coarse = part_pair(zoomed, zoomed_views, part, VIEWS, COARSE_PIXELS)
     if not start.found or coarse is None:
         return None
-    T = refine(coarse, start.T, MAX_ITERATIONS, with_scale=with_scale).T
-    world = inverse_similarity(T) @ world.to(T)
+    fits = []
+    for T in (start.T, *start.alike):
+        T = refine(coarse, T, MAX_ITERATIONS, with_scale=with_scale).T
+        fits.append(_refined(splats, views, part, inverse_similarity(T) @ zoom.to(T), with_scale))
+    best = min(fits, key=lambda fit: fit.ratio)
+    rivals = (fit for fit in fits if fit.ratio < ALIKE * best.ratio)
+    turns = [so3_log((rigid_of(fit.T) @ inverse(rigid_of(best.T)))[:3, :3]).norm() for fit in rivals]
+    return replace(best, doubtful=any(turn > OTHERWISE for turn in turns))
+
+
+def _refined(
+    splats: tuple[Splat, Splat],
+    views: tuple[Sequence[View], Sequence[View]],
+    part: int,
+    world: Tensor,
+    with_scale: bool,
+) -> WorldFit:
+    """`fit_world` from a similarity near the best."""
+    eye = torch.eye(4).to(world)
     flush = any(is_flush(some, part) for some in views)
     for without in (False,) if flush else (False, True):
         there = moved_views(views[1], world)
@@ -76,10 +99,10 @@ def fit_world(
         pair = part_pair(brought, (views[0], there), part, ALL_VIEWS, FINE_PIXELS, near=True)
         pair = replace(pair, **IN_EVEN_LIGHT)
         if without:
-            pair = without_haze(pair, torch.eye(4).to(T), (FreeSpace.of(views[0]), FreeSpace.of(there)))
-        found = refine(pair, torch.eye(4).to(T), 2 * MAX_ITERATIONS, with_scale=with_scale)
+            pair = without_haze(pair, eye, (FreeSpace.of(views[0]), FreeSpace.of(there)))
+        found = refine(pair, eye, 2 * MAX_ITERATIONS, with_scale=with_scale)
         world = inverse_similarity(found.T) @ world
-    covariance = torch.zeros(7, 7, dtype=torch.float64, device=T.device)
+    covariance = torch.zeros(7, 7).to(world)
     n = found.equations.H.shape[-1]
     covariance[:n, :n] = motion_covariance(pair, found.T, found.equations)
     return WorldFit(world, covariance, found.cost / max(pair.own_cost(), 1e-12))
@@ -104,9 +127,13 @@ def fit_worlds(
     with_scale: bool,
     seed: int = 0,
 ) -> tuple[int, list[WorldFit]] | None:
-    """The first of `parts` that fits well in all states, or else that which fits best, and every state's `fit_world` by
-    it but state 0's; None where no part is seen in all states."""
+    """The first of `parts` that fits well in all states, and so by no quite other turn, or else that which fits best,
+    and every state's `fit_world` by it but state 0's; None where no part is seen in all states."""
     best: tuple[int, list[WorldFit]] | None = None
+
+    def rank(fits: Sequence[WorldFit]) -> tuple[bool, float]:
+        return any(f.doubtful for f in fits), max(f.ratio for f in fits)
+
     for part in parts:
         fits = []
         for s in range(1, len(splats)):
@@ -114,9 +141,9 @@ def fit_worlds(
             fits.append(fit_world(*pair, part, with_scale, seed))
         if None in fits:
             continue
-        if best is None or max(f.ratio for f in fits) < max(f.ratio for f in best[1]):
+        if best is None or rank(fits) < rank(best[1]):
             best = part, fits
-        if max(f.ratio for f in best[1]) < SUSPECT:
+        if rank(best[1]) < (False, SUSPECT):
             break
     return best
 
@@ -147,6 +174,7 @@ def world_record(state: str, part: str, T: Tensor, fit: WorldFit) -> dict[str, A
         "scale_deviation": float(scale_of(T) * scale),
         "turn_deviation_degrees": math.degrees(float(turn)),
         "residual_ratio": fit.ratio,
+        "doubtful": fit.doubtful,
     }
 
 
@@ -159,6 +187,8 @@ def world_sentence(record: dict[str, Any], first: str) -> str:
         f"{record['scale']:.5f} +- {record['scale_deviation']:.5f}, turned by {turn:.2f} "
         f"+- {record['turn_deviation_degrees']:.2f} deg"
     )
+    if record["doubtful"]:
+        return f"{sentence}; after a quite other turn its images fit hardly worse, name another part by --root."
     if record["residual_ratio"] > SUSPECT:
         kept = record["scale_deviation"] == 0
         mend = "let its scale be found (--worlds similar), or name" if kept else "check the result, or name"

@@ -9,8 +9,10 @@ from splatart_ns.geometry.se3 import transform_points
 from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_of, similarity
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import world
+from splatart_ns.stages.render_choice import initial_motion
 from splatart_ns.stages.visibility import visibility
 from splatart_ns.stages.world import (
+    WorldFit,
     anchors,
     fit_world,
     fit_worlds,
@@ -60,6 +62,55 @@ def test_a_world_of_another_scale_is_to_be_brought_together_with_its_scale(with_
     part, (found,) = fit_worlds(splats, views, seen, [1, 2], with_scale)
     sentence = world_sentence(world_record("state_01", f"part {part}", found.T, found), "state_00")
     assert words in sentence if words else "fit badly" not in sentence
+
+
+def turned_over(monkeypatch):
+    """Lets a part be found turned over first, and as it is among what looks alike."""
+    over = motion((180, 0, 0), (0, 0, -0.6))
+
+    def found(*arguments):
+        motion_found = initial_motion(*arguments)
+        return replace(motion_found, T=motion_found.T @ over, alike=(motion_found.T,))
+
+    monkeypatch.setattr(world, "initial_motion", found)
+
+
+def test_of_turns_by_which_a_part_looks_alike_the_one_that_fits_best_brings_worlds_together(monkeypatch):
+    splats, views, T = apart(1.6)
+    seen = [visibility(s, v) for s, v in zip(splats, views, strict=True)]
+    turned_over(monkeypatch)
+    found = fit_world(splats, views, seen, 1, with_scale=True)
+    assert angle_deg(rigid_of(found.T), rigid_of(inverse_similarity(T))) < 0.5 and not found.doubtful
+
+
+@pytest.mark.parametrize(("worse", "doubtful"), [(1.04, True), (1.06, False)])
+def test_a_world_is_doubtful_where_a_quite_other_turn_fits_hardly_worse(monkeypatch, worse, doubtful):
+    splats, views, _ = apart(1.0)
+    seen = [visibility(s, v) for s, v in zip(splats, views, strict=True)]
+    turned_over(monkeypatch)
+    ratios = iter([worse, 1.0])
+    monkeypatch.setattr(world, "_refined", lambda *given: WorldFit(given[3], torch.zeros(7, 7), next(ratios)))
+    found = fit_world(splats, views, seen, 1, with_scale=False)
+    assert found.ratio == 1 and found.doubtful == doubtful
+    told = world_record("state_01", "body", found.T, found)
+    assert ("quite other turn" in world_sentence(told, "state_00")) == doubtful == told["doubtful"]
+
+
+@pytest.mark.parametrize(
+    ("fits", "chosen"),
+    [
+        ([(1.1, True), (1.3, False)], 2),
+        ([(1.3, True), (1.1, True)], 2),
+        ([(1.3, False), (1.1, False)], 1),
+        ([(9.0, False), (1.1, True), (8.0, False)], 3),
+    ],
+)
+def test_a_part_that_fits_by_one_turn_alone_brings_worlds_together(monkeypatch, fits, chosen):
+    eye = torch.eye(4).double()
+    worlds = [WorldFit(eye, torch.zeros(7, 7), ratio, doubtful) for ratio, doubtful in fits]
+    monkeypatch.setattr(world, "fit_world", lambda *given: worlds[given[3] - 1])
+    nothing = [None, None]
+    assert fit_worlds(nothing, nothing, nothing, range(1, len(fits) + 1), True)[0] == chosen
 
 
 def test_haze_at_one_edge_makes_no_world_larger(monkeypatch):
