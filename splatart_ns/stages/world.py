@@ -20,11 +20,21 @@ from splatart_ns.stages.part_pair import IN_EVEN_LIGHT, part_pair
 from splatart_ns.stages.pose_evidence import ALL_VIEWS, MAX_ITERATIONS
 from splatart_ns.stages.refinement import motion_covariance, refine
 from splatart_ns.stages.registration import MIN_POINTS, part_points
-from splatart_ns.stages.render_choice import COARSE_PIXELS, FINE_PIXELS, OTHERWISE, SUSPECT, VIEWS, initial_motion
+from splatart_ns.stages.render_choice import (
+    COARSE_PIXELS,
+    DOUBTFUL_VIEWS,
+    FINE_PIXELS,
+    OTHERWISE,
+    SUSPECT,
+    VIEWS,
+    initial_motion,
+)
 
 ALIKE = 1.05
-"""A quite other turn that fits less than this many times worse may be the right one. Of a box's body, refined, the
-right one fits 1.04 times worse than each state's own Gaussians, three others by which it looked alike 1.16 and 1.17."""
+"""A quite other turn that fits less than this many times worse may be the right one. Three by which a box's body looked
+alike fitted 1.11 to 1.14 times worse than the right one, after it was refined."""
+FEW = 10
+"""Steps that tell which fits best."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +63,9 @@ def fit_world(
     """The similarity, or the rigid motion, of another state's world to that of state 0 under which `part` rests.
 
     Many-start registration chosen by rendering, after the part is given the radius that it has in state 0, and then
-    Gauss-Newton on images for all seven unknowns, from every motion by which it looks alike: on few pixels, on many
-    and, unless the part lies flush with others, once more without haze (see `free_space`), which made a pair of
-    scissors .1 % too small. None where the images show too little of the part.
+    Gauss-Newton on images for all seven unknowns: on few pixels, on more where it looks alike after other motions, to
+    choose among these, on many and, unless the part lies flush with others, once more without haze (see `free_space`),
+    which made a pair of scissors .1 % too small. None where the images show too little of the part.
 
     Args:
         splats: The labelled splats of state 0 and of the other state, each in its own world.
@@ -73,14 +83,18 @@ def fit_world(
     coarse = part_pair(zoomed, zoomed_views, part, VIEWS, COARSE_PIXELS)
     if not start.found or coarse is None:
         return None
-    fits = []
-    for T in (start.T, *start.alike):
-        T = refine(coarse, T, MAX_ITERATIONS, with_scale=with_scale).T
-        fits.append(_refined(splats, views, part, inverse_similarity(T) @ zoom.to(T), with_scale))
-    best = min(fits, key=lambda fit: fit.ratio)
-    rivals = (fit for fit in fits if fit.ratio < ALIKE * best.ratio)
-    turns = [so3_log((rigid_of(fit.T) @ inverse(rigid_of(best.T)))[:3, :3]).norm() for fit in rivals]
-    return replace(best, doubtful=any(turn > OTHERWISE for turn in turns))
+    T, doubtful = refine(coarse, start.T, MAX_ITERATIONS, with_scale=with_scale).T, False
+    if start.alike:
+        closer = [refine(coarse, other, MAX_ITERATIONS, with_scale=with_scale).T for other in start.alike]
+        fine = part_pair(zoomed, zoomed_views, part, DOUBTFUL_VIEWS, FINE_PIXELS)
+        fine = replace(fine, **IN_EVEN_LIGHT)
+        ends = sorted((refine(fine, near, FEW, with_scale=with_scale) for near in (T, *closer)), key=lambda e: e.cost)
+        T = ends[0].T
+        rivals = [end.T for end in ends if end.cost < ALIKE * ends[0].cost]
+        turns = [so3_log((rigid_of(rival) @ inverse(rigid_of(T)))[:3, :3]).norm() for rival in rivals]
+        doubtful = any(turn > OTHERWISE for turn in turns)
+    fit = _refined(splats, views, part, inverse_similarity(T) @ zoom.to(T), with_scale)
+    return replace(fit, doubtful=doubtful)
 
 
 def _refined(
@@ -187,10 +201,10 @@ def world_sentence(record: dict[str, Any], first: str) -> str:
         f"{record['scale']:.5f} +- {record['scale_deviation']:.5f}, turned by {turn:.2f} "
         f"+- {record['turn_deviation_degrees']:.2f} deg"
     )
-    if record["doubtful"]:
-        return f"{sentence}; after a quite other turn its images fit hardly worse, name another part by --root."
     if record["residual_ratio"] > SUSPECT:
         kept = record["scale_deviation"] == 0
         mend = "let its scale be found (--worlds similar), or name" if kept else "check the result, or name"
         return f"{sentence}; its images fit badly, {mend} another part by --root."
+    if record["doubtful"]:
+        return f"{sentence}; after a quite other turn its images fit hardly worse, name another part by --root."
     return f"{sentence}."

@@ -88,10 +88,15 @@ def test_a_world_is_doubtful_where_a_quite_other_turn_fits_hardly_worse(monkeypa
     splats, views, _ = apart(1.0)
     seen = [visibility(s, v) for s, v in zip(splats, views, strict=True)]
     turned_over(monkeypatch)
-    ratios = iter([worse, 1.0])
-    monkeypatch.setattr(world, "_refined", lambda *given: WorldFit(given[3], torch.zeros(7, 7), next(ratios)))
+    costs, refine = iter([worse, 1.0]), world.refine
+
+    def refined(pair, T, steps, **options):
+        end = refine(pair, T, steps, **options)
+        return replace(end, cost=next(costs)) if steps == world.FEW else end
+
+    monkeypatch.setattr(world, "refine", refined)
     found = fit_world(splats, views, seen, 1, with_scale=False)
-    assert found.ratio == 1 and found.doubtful == doubtful
+    assert next(costs, None) is None and found.doubtful == doubtful
     told = world_record("state_01", "body", found.T, found)
     assert ("quite other turn" in world_sentence(told, "state_00")) == doubtful == told["doubtful"]
 
