@@ -35,6 +35,11 @@ class Pass:
 
 PASSES = tuple(Pass(0.1 * k, round(1000 * 10 ** (k / 9))) for k in range(1, 10))
 """Many short ones: the splat follows the cameras, and they can only come as near as it is sharp."""
+TRIED = PASSES[4]
+"""Where no silhouettes tell whether cameras are exact, they are refined up to here, and then are or are not."""
+EXACT_PIXELS = 0.7
+"""Cameras that this has moved by less are: exact ones of two objects in a room measured 0.35 to 0.54, such as were off
+by 1.1 pixels 0.8."""
 
 
 @torch.no_grad()
@@ -128,13 +133,6 @@ def _without_drift(viewmats: Tensor, given: Tensor, centroid: Tensor) -> Tensor:
     out = viewmats.clone()
     out[:, :3, 3] += after / nearer - after
     return out
-
-
-TRIED = PASSES[4]
-"""Where no silhouettes tell whether cameras are exact, they are refined up to here, and then are or are not."""
-EXACT_PIXELS = 0.7
-"""Cameras that this has moved by less are: exact ones of two objects in a room measured 0.35 to 0.54, such as were off
-by 1.1 pixels 0.8."""
 
 
 def image_shift(viewmats: Tensor, given: Tensor, views: Sequence[View]) -> float:

@@ -141,13 +141,9 @@ def fit_worlds(
     with_scale: bool,
     seed: int = 0,
 ) -> tuple[int, list[WorldFit]] | None:
-    """The first of `parts` that fits well in all states, and so by no quite other turn, or else that which fits best,
-    and every state's `fit_world` by it but state 0's; None where no part is seen in all states."""
+    """The first of `parts` that fits well in all states, or else that which fits best, and every state's `fit_world` by
+    it but state 0's; None where no part is seen in all states."""
     best: tuple[int, list[WorldFit]] | None = None
-
-    def rank(fits: Sequence[WorldFit]) -> tuple[bool, float]:
-        return any(f.doubtful for f in fits), max(f.ratio for f in fits)
-
     for part in parts:
         fits = []
         for s in range(1, len(splats)):
@@ -155,9 +151,9 @@ def fit_worlds(
             fits.append(fit_world(*pair, part, with_scale, seed))
         if None in fits:
             continue
-        if best is None or rank(fits) < rank(best[1]):
+        if best is None or max(f.ratio for f in fits) < max(f.ratio for f in best[1]):
             best = part, fits
-        if rank(best[1]) < (False, SUSPECT):
+        if max(f.ratio for f in best[1]) < SUSPECT:
             break
     return best
 

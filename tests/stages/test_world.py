@@ -12,7 +12,6 @@ from splatart_ns.stages import world
 from splatart_ns.stages.render_choice import initial_motion
 from splatart_ns.stages.visibility import visibility
 from splatart_ns.stages.world import (
-    WorldFit,
     anchors,
     fit_world,
     fit_worlds,
@@ -99,23 +98,6 @@ def test_a_world_is_doubtful_where_a_quite_other_turn_fits_hardly_worse(monkeypa
     assert next(costs, None) is None and found.doubtful == doubtful
     told = world_record("state_01", "body", found.T, found)
     assert ("quite other turn" in world_sentence(told, "state_00")) == doubtful == told["doubtful"]
-
-
-@pytest.mark.parametrize(
-    ("fits", "chosen"),
-    [
-        ([(1.1, True), (1.3, False)], 2),
-        ([(1.3, True), (1.1, True)], 2),
-        ([(1.3, False), (1.1, False)], 1),
-        ([(9.0, False), (1.1, True), (8.0, False)], 3),
-    ],
-)
-def test_a_part_that_fits_by_one_turn_alone_brings_worlds_together(monkeypatch, fits, chosen):
-    eye = torch.eye(4).double()
-    worlds = [WorldFit(eye, torch.zeros(7, 7), ratio, doubtful) for ratio, doubtful in fits]
-    monkeypatch.setattr(world, "fit_world", lambda *given: worlds[given[3] - 1])
-    nothing = [None, None]
-    assert fit_worlds(nothing, nothing, nothing, range(1, len(fits) + 1), True)[0] == chosen
 
 
 def test_haze_at_one_edge_makes_no_world_larger(monkeypatch):
