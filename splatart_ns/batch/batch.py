@@ -240,7 +240,7 @@ class _Batch:
         """A stage has ended."""
         if isinstance(result, Death):
             key = next(s.key for s in thing.stages if s.name == stage)
-            result = Marker(key, 0.0, failed=str(result), kind="died")
+            result = Marker(key, 0.0, failed=result.how, kind="died")
             write_marker(self._out, thing.entry.name, stage, result)
         thing.running.discard(stage)
         thing.markers[stage] = result

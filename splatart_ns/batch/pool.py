@@ -30,8 +30,11 @@ _ENVIRONMENT = threading.Lock()
 """Held while `os.environ` is that of a process to start: pools in several threads share it."""
 
 
-class Death(Exception):
-    """A task's process ended before the task; the message says how."""
+@dataclass(frozen=True)
+class Death:
+    """A task's process ended before the task."""
+
+    how: str
 
 
 class Engine(Protocol):

@@ -61,7 +61,7 @@ def test_a_process_that_dies_takes_its_own_task_alone(pool):
     pool.start("sleeps", Needs(), time.sleep, 0.2)
     ended = results(pool, 2)
     assert ended["sleeps"] is None
-    assert isinstance(ended["ends"], Death) and "exit code 7" in str(ended["ends"])
+    assert isinstance(ended["ends"], Death) and "exit code 7" in ended["ends"].how
     pool.start("next", Needs(), abs, -1)
     assert results(pool, 1) == {"next": 1}
 
