@@ -52,7 +52,7 @@ class RayCluster:
 
     def start(self, ticket: Any, needs: Needs, function: Callable, *arguments: Any) -> None:
         reference = self._task.options(
-            num_cpus=needs.cores,
+            num_cpus=1,
             num_gpus=1 if needs.gpu and self.gpus else 0,
             memory=min(needs.memory_mb * 2**20, self._memory),  # more than any node has would wait for ever
             max_retries=_RETRIES,

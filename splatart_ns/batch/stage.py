@@ -31,9 +31,8 @@ MARKERS = "stages"
 
 @dataclass(frozen=True)
 class Needs:
-    """What a stage takes of a machine."""
+    """What a stage takes of a machine, besides a core."""
 
-    cores: int = 1
     memory_mb: int = 1000
     gpu: bool = False
     """Whether it computes on a GPU where there are GPUs."""
@@ -57,8 +56,6 @@ class Marker:
 
     key: str
     seconds: float
-    cpu_seconds: float = 0.0
-    """Of all threads of its process; on a busy machine less than `seconds`."""
     outcome: dict[str, Any] = field(default_factory=dict)
     files: dict[str, int] = field(default_factory=dict)
     """Size of every file it left, by its name in the bundle."""
@@ -153,7 +150,7 @@ def stage_key(*inputs: Any) -> str:
 
 
 _MARKER = {
-    **{"key": str, "seconds": NUMBER, "cpu_seconds": NUMBER, "outcome": dict, "files": dict},
+    **{"key": str, "seconds": NUMBER, "outcome": dict, "files": dict},
     **{"failed": str, "kind": str, "trace": str},
 }
 """Shape of a marker's file."""
@@ -174,6 +171,7 @@ def fingerprint(capture: str) -> str:
 def read_marker(out: Storage, name: str, stage: str, outcome: Any = dict) -> Marker | None:
     """How a stage ended, if it did. One that is damaged, or whose outcome has not this shape, counts as none."""
     told = asdict(Marker("", 0.0)) | (parse(out.read(_marker_path(name, stage)), {"key": str}) or {})
+    told.pop("cpu_seconds", None)  # versions before wrote it
     if told.keys() != _MARKER.keys() or not has_shape(told, _MARKER) or not told["key"]:
         return None
     return Marker(**told) if told["failed"] or has_shape(told["outcome"], outcome) else None
@@ -194,7 +192,11 @@ def perform(recipe: Recipe, entry: Entry, stage: Stage, out_url: str) -> Marker:
 
     A result that is there already, as of a task that an engine starts twice, is not made again.
     """
-    clock, out = _Clock(), open_storage(out_url)
+    start, out = time.perf_counter(), open_storage(out_url)
+
+    def seconds() -> float:
+        return round(time.perf_counter() - start, 3)
+
     try:
         earlier = read_marker(out, entry.name, stage.name, recipe.outcome_shape(stage.name))
         if earlier is not None and earlier.is_whole(stage.key, out.files(entry.name)):
@@ -204,29 +206,19 @@ def perform(recipe: Recipe, entry: Entry, stage: Stage, out_url: str) -> Marker:
             outcome, kept = recipe.run(stage.name, work)
             out.remove(_marker_path(entry.name, stage.name))  # its files change now
             files = publish(out, work.folder, kept, entry.name)
-        marker = Marker(stage.key, **clock.taken(), outcome=outcome, files=files)
+        marker = Marker(stage.key, seconds(), outcome=outcome, files=files)
     except InputError as error:
-        marker = Marker(stage.key, **clock.taken(), failed=str(error), kind="input")
+        marker = Marker(stage.key, seconds(), failed=str(error), kind="input")
     except Exception as error:
         words = str(error).strip().splitlines() or [""]
         reason = f"{type(error).__name__}: {words[-1]}"[:500]
-        marker = Marker(stage.key, **clock.taken(), failed=reason, kind="crash", trace=traceback.format_exc())
+        marker = Marker(stage.key, seconds(), failed=reason, kind="crash", trace=traceback.format_exc())
     try:
         write_marker(out, entry.name, stage.name, marker)
     except Exception as error:  # the disk is full, the store is away
         reason = f"{type(error).__name__}: {error}"
-        return Marker(stage.key, **clock.taken(), failed=reason, kind="crash", trace=traceback.format_exc())
+        return Marker(stage.key, seconds(), failed=reason, kind="crash", trace=traceback.format_exc())
     return marker
-
-
-class _Clock:
-    def __init__(self):
-        self._wall, self._cpu = time.perf_counter(), time.process_time()
-
-    def taken(self) -> dict[str, float]:
-        """Of a marker."""
-        wall, cpu = time.perf_counter() - self._wall, time.process_time() - self._cpu
-        return {"seconds": round(wall, 3), "cpu_seconds": round(cpu, 3)}
 
 
 @contextmanager

@@ -66,6 +66,14 @@ def test_what_changed_is_done_again_and_nothing_else(run, captures, log, tmp_pat
     assert log()[done:] == ["b join"]
 
 
+def test_a_marker_of_a_version_before_still_counts(run, captures, tmp_path):
+    entries = captures("a")
+    run(entries)
+    for marker in (tmp_path / "out/a/stages").iterdir():
+        marker.write_text(json.dumps(json.loads(marker.read_text()) | {"cpu_seconds": 0.25}))
+    assert run(entries).stages == []
+
+
 def test_a_result_that_was_damaged_is_made_again(run, captures, log, tmp_path):
     entries = captures("a")
     run(entries)
