@@ -72,6 +72,37 @@ def test_claims_of_the_dead_are_void(session, storage, told):
     assert storage.files(".batch/claims") == {}
 
 
+class Meanwhile:
+    """A storage in which something happens before the first file is created."""
+
+    def __init__(self, storage, happens):
+        self._storage, self._happens = storage, [happens]
+
+    def __getattr__(self, name):
+        return getattr(self._storage, name)
+
+    def create(self, path, data):
+        while self._happens:
+            self._happens.pop()()
+        return self._storage.create(path, data)
+
+
+def test_a_claim_of_the_dead_that_another_has_taken_and_renewed_meanwhile(session, storage):
+    dead, slow, other = session(), session(), session()
+    assert dead.claim("a")
+    dies(storage, dead, pid=ended_process())
+
+    def renew():
+        assert other.claim("a")
+        other.release("a")
+        assert other.claim("a")
+
+    slow._storage = Meanwhile(storage, renew)
+    assert not slow.claim("a") and other.claim("a")
+    other.release("a")
+    assert storage.files(".batch/claims") == {}
+
+
 def test_a_batch_of_another_machine_is_alive_for_a_while(session, storage):
     far, near = session(), session()
     assert far.claim("a")
