@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import subprocess
@@ -13,22 +14,39 @@ CALM_THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}
 A spinning OpenMP pool makes two busy processes on one machine many times slower. OpenBLAS shares even the inverse of a
 4x4 matrix between threads, which takes it 15 times as long (5 us in place of 0.3).
 """
-_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+_CGROUP = Path("/sys/fs/cgroup")
+"""Where Linux says what a container may use."""
 
 
 def num_cores() -> int:
-    """Cores that this process may use: OMP_NUM_THREADS where it is set, else those it is bound to."""
+    """Cores that this process may use: OMP_NUM_THREADS where it is set, else those it is bound to, or fewer where its
+    container has less time of them."""
     threads = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]  # "4,2" is for nested regions
     if threads.isdigit():
         return max(1, int(threads))
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(bound, _quota()))
 
 
 def memory_mb() -> int:
     """Memory of this machine, or of the container that this process runs in, in MiB."""
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    limit = _CGROUP_LIMIT.read_text().strip() if _CGROUP_LIMIT.is_file() else ""
+    limit = _told("memory.max")
     return (min(memory, int(limit)) if limit.isdigit() else memory) // 2**20
+
+
+def _quota() -> float:
+    """Cores whose whole time this container may take; infinite where nothing limits it."""
+    # By version 2 of cgroups, else by version 1: "max" and -1 are no limit.
+    told = _told("cpu.max") or f"{_told('cpu/cpu.cfs_quota_us')} {_told('cpu/cpu.cfs_period_us')}"
+    quota, _, period = told.partition(" ")
+    return int(quota) // int(period) if quota.isdigit() and period.isdigit() and int(period) else math.inf
+
+
+def _told(name: str) -> str:
+    """A file of the cgroup; "" where there is none."""
+    file = _CGROUP / name
+    return file.read_text().strip() if file.is_file() else ""
 
 
 def gpu_memory_mb() -> dict[str, int]:

@@ -1,8 +1,57 @@
 """What this machine lends."""
 
+import os
+
 import pytest
 
-from splatart_ns.machine import gpu_memory_mb
+from splatart_ns import machine
+from splatart_ns.machine import gpu_memory_mb, memory_mb, num_cores
+
+
+@pytest.fixture
+def container(tmp_path, monkeypatch):
+    """Makes a container's limits, contents by files, on a machine of eight cores."""
+    monkeypatch.setattr(machine, "_CGROUP", tmp_path)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)))
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+
+    def make(limits):
+        for name, text in limits.items():
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).write_text(text)
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("limits", "cores"),
+    [
+        ({}, 8),
+        ({"cpu.max": "max 100000\n"}, 8),
+        ({"cpu.max": "200000 100000\n"}, 2),
+        ({"cpu.max": "350000 100000\n"}, 3),
+        ({"cpu.max": "50000 100000\n"}, 1),
+        ({"cpu.max": "1600000 100000\n"}, 8),
+        ({"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, 8),
+        ({"cpu/cpu.cfs_quota_us": "400000\n", "cpu/cpu.cfs_period_us": "100000\n"}, 4),
+    ],
+)
+def test_cores_are_those_that_a_container_may_use_the_whole_time(container, limits, cores):
+    container(limits)
+    assert num_cores() == cores
+
+
+def test_the_user_says_how_many_cores_a_container_has(container, monkeypatch):
+    container({"cpu.max": "200000 100000"})
+    monkeypatch.setenv("OMP_NUM_THREADS", "5")
+    assert num_cores() == 5
+
+
+def test_memory_is_that_of_a_container(container):
+    container({"memory.max": f"{64 * 2**20}\n"})
+    assert memory_mb() == 64
+    container({"memory.max": "max\n"})
+    assert memory_mb() > 64
 
 
 @pytest.fixture
