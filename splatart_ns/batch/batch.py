@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -14,7 +15,7 @@ from splatart_ns.batch.claim import Session
 from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.pool import Death, Engine
 from splatart_ns.batch.stage import Marker, Needs, Recipe, Stage, perform, read_marker, write_marker
-from splatart_ns.batch.storage import Storage, open_storage
+from splatart_ns.batch.storage import UNANSWERED, Storage, open_storage, patiently
 
 _LOOKED_AHEAD = 16
 """Objects whose files are listed before their turn: a store answers slowly, but many at a time."""
@@ -145,10 +146,15 @@ class _Batch:
         thing = next(self._objects, None)
         if thing is None:
             return False
-        name = thing.entry.name
+        name, claimed = thing.entry.name, False
+        if thing.failed is None and not self._is_done(thing):
+            try:
+                claimed = patiently(lambda: self._session.claim(name))
+            except UNANSWERED as error:
+                thing.markers[""] = _unanswered(error)
         if thing.failed is not None or self._is_done(thing):
             self._tell(thing)
-        elif not self._session.claim(name):
+        elif not claimed:
             self._postponed.append((thing.index, thing.entry))
         else:
             thing = self._open(thing.index, thing.entry)  # again: another batch may just have left it
@@ -195,7 +201,7 @@ class _Batch:
                 self._plan(thing)
                 self._read(thing, files)
         except Exception as error:  # libraries of stores raise many types
-            thing.markers[""] = Marker("", 0.0, failed=str(error) or type(error).__name__, kind="input")
+            thing.markers[""] = _unanswered(error)
         return thing
 
     def _plan(self, thing: _Object) -> None:
@@ -241,14 +247,18 @@ class _Batch:
         if isinstance(result, Death):
             key = next(s.key for s in thing.stages if s.name == stage)
             result = Marker(key, 0.0, failed=result.how, kind="died")
-            write_marker(self._out, thing.entry.name, stage, result)
+            with suppress(*UNANSWERED):  # it has failed anyway
+                patiently(lambda: write_marker(self._out, thing.entry.name, stage, result))
         thing.running.discard(stage)
         thing.markers[stage] = result
         thing.fresh = True
         self._watcher.ended(thing.entry, stage, result)
         if not result.failed and len(thing.stages) == 1:
             self._plan(thing)
-            self._read(thing, self._out.files(thing.entry.name))
+            try:
+                patiently(lambda: self._read(thing, self._out.files(thing.entry.name)))
+            except UNANSWERED as error:
+                thing.markers[""] = _unanswered(error)
         if thing.failed is None and not self._is_done(thing):
             self._make_ready(thing)
             return
@@ -273,3 +283,8 @@ class _Batch:
         if failed is None:
             row |= self._recipe.row(thing.entry, {name: marker.outcome for name, marker in thing.markers.items()})
         self._watcher.finished(thing.index, row)
+
+
+def _unanswered(error: Exception) -> Marker:
+    """Of an object of which this could not be found out."""
+    return Marker("", 0.0, failed=str(error) or type(error).__name__, kind="input")

@@ -9,9 +9,10 @@ import socket
 import threading
 import time
 import uuid
+from contextlib import suppress
 from urllib.parse import quote
 
-from splatart_ns.batch.storage import Storage
+from splatart_ns.batch.storage import UNANSWERED, Storage
 from splatart_ns.errors import InputError
 from splatart_ns.machine import process_lives
 from splatart_ns.shape import NUMBER, parse
@@ -52,24 +53,29 @@ class Session:
             return False
         if not self._storage.create(_path(name, last + 1), self.name.encode()):
             return False
-        # What was found may have been released, and claimed anew from the start, meanwhile.
-        if {number: session for number, session in self._claims(name).items() if number <= last} != claims:
-            self._storage.remove(_path(name, last + 1))
-            return False
-        return True
+        sure = False
+        try:
+            # What was found may have been released, and claimed anew from the start, meanwhile.
+            sure = {number: session for number, session in self._claims(name).items() if number <= last} == claims
+        finally:
+            if not sure:
+                self._storage.remove(_path(name, last + 1))
+        return sure
 
     def release(self, name: str) -> None:
-        """Let other batches work on an object."""
-        claims = self._claims(name)
-        if claims and claims[max(claims)] == self.name:
-            for number in sorted(claims):  # its own last: until then nobody else gets in
-                self._storage.remove(_path(name, number))
+        """Let other batches work on an object; where the storage does not answer, when this one has ended."""
+        with suppress(*UNANSWERED):
+            claims = self._claims(name)
+            if claims and claims[max(claims)] == self.name:
+                for number in sorted(claims):  # its own last: until then nobody else gets in
+                    self._storage.remove(_path(name, number))
 
     def end(self) -> None:
         """Show no more life; all claims that are left are void."""
         self._ended.set()
         self._thread.join()
-        self._storage.remove(f"{_SESSIONS}/{self.name}.json")
+        with suppress(*UNANSWERED):  # the dead show none either
+            self._storage.remove(f"{_SESSIONS}/{self.name}.json")
 
     def _claims(self, name: str) -> dict[int, str]:
         """Number to session, of all claims of an object."""
@@ -100,7 +106,7 @@ class Session:
         while not self._ended.wait(_BEAT):
             try:
                 self._beat()
-            except (OSError, InputError):  # a store that does not answer may do so the next time
+            except UNANSWERED:  # a store that does not answer may do so the next time
                 continue
 
 

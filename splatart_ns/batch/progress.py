@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 from rich.console import Console
@@ -14,7 +15,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.report import Report
 from splatart_ns.batch.stage import Marker
-from splatart_ns.batch.storage import Storage
+from splatart_ns.batch.storage import UNANSWERED, Storage, patiently
 
 _REPORT_EVERY = 60.0
 """Seconds between two reports while a batch runs; more where writing one takes long."""
@@ -50,7 +51,7 @@ class LiveProgress:
     def __exit__(self, *_: object) -> None:
         self._show(now=True)
         self._bar.stop()
-        self.report.write(self._out)
+        patiently(lambda: self.report.write(self._out))
 
     def started(self, entry: Entry, stage: str) -> None:
         self._running[f"{entry.name}: {stage}"] += 1
@@ -71,7 +72,8 @@ class LiveProgress:
         self._show()
         if time.monotonic() > self._next_report:
             start = time.monotonic()
-            self.report.write(self._out)
+            with suppress(*UNANSWERED):  # the next one may be written
+                self.report.write(self._out)
             took = time.monotonic() - start
             self._next_report = start + max(_REPORT_EVERY, 50 * took)
 

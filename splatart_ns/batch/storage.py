@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 from urllib.parse import urlsplit
 
 from splatart_ns.errors import InputError
 from splatart_ns.files import replacing
+
+UNANSWERED = (OSError, InputError)
+"""What a storage raises that does not answer, or cannot do what it is asked."""
+_PAUSES = (0.2, 1.0, 3.0)
+"""Seconds before it is asked again."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -65,6 +72,16 @@ def open_storage(url: str) -> Storage:
     if scheme in ("", "file"):
         return Folder(os.path.abspath(url.removeprefix("file://")))
     return ObjectStore(url.rstrip("/"))
+
+
+def patiently(ask: Callable[[], T]) -> T:
+    """What `ask` returns, which asks a storage: a store that does not answer may do so a little later."""
+    for pause in _PAUSES:
+        try:
+            return ask()
+        except UNANSWERED:
+            time.sleep(pause)
+    return ask()
 
 
 def join(path: str, name: str) -> str:

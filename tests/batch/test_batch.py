@@ -14,9 +14,11 @@ from pathlib import Path
 import pytest
 from stub_recipe import StubRecipe
 
+from splatart_ns.batch import batch, storage
 from splatart_ns.batch.batch import run_batch
 from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.pool import ProcessPool
+from splatart_ns.batch.storage import Folder
 from splatart_ns.errors import InputError
 
 STAGES = ["look", "copy one", "copy two", "join"]
@@ -146,6 +148,55 @@ def test_an_output_folder_that_cannot_be_written_is_a_mistake(run, captures, tmp
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="file/out: cannot be written"):
         run(captures("a"), tmp_path / "file/out")
+
+
+class Unanswered:
+    """A storage that does not answer the first `times` requests that `asked` picks by their names and paths."""
+
+    def __init__(self, storage, asked, times):
+        self._storage, self._asked, self.left = storage, asked, times
+        self.url = storage.url
+
+    def __getattr__(self, name):
+        def answer(path, *more):
+            if self.left and self._asked(name, path):
+                self.left -= 1
+                raise OSError("no answer")
+            return getattr(self._storage, name)(path, *more)
+
+        return answer
+
+
+REQUESTS = {
+    "claim": lambda name, path: (name, path) == ("create", ".batch/claims/bad.1"),
+    "listing": lambda name, path: (name, path) == ("files", "bad"),
+    "marker of a death": lambda name, path: (name, path) == ("write", "bad/stages/join.json"),
+    "release": lambda name, path: (name, path) == ("remove", ".batch/claims/bad.1"),
+    "end": lambda name, path: name == "remove" and path.startswith(".batch/sessions/"),
+}
+
+
+@pytest.mark.parametrize("what", REQUESTS)
+@pytest.mark.parametrize("times", [1, 10**6])
+def test_requests_without_an_answer_end_their_own_object_at_most(run, captures, monkeypatch, tmp_path, what, times):
+    looked = tmp_path / "out/bad/stages/look.json"  # until then listings are those of an object that is opened
+    out = Unanswered(
+        Folder(str(tmp_path / "out")),
+        lambda *request: REQUESTS[what](*request) and (what != "listing" or looked.exists()),
+        times,
+    )
+    monkeypatch.setattr(batch, "open_storage", lambda url: out)
+    monkeypatch.setattr(storage, "_PAUSES", (0.0, 0.0))
+    dies = what == "marker of a death"
+    told = run([*captures("bad", **({"do": "die"} if dies else {})), *captures("a", "b")])
+    assert out.left < times
+    lost = times > 1 and what in ("claim", "listing")
+    assert told.status() == {"bad": "failed" if lost or dies else "done", "a": "done", "b": "done"}
+    if lost:
+        assert told.rows["bad"]["reason"] == "no answer"
+    if dies:
+        assert "SIGKILL" in told.rows["bad"]["reason"]
+        assert (tmp_path / "out/bad/stages/join.json").exists() == (times == 1)
 
 
 DRIVER = """

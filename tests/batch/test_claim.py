@@ -103,6 +103,22 @@ def test_a_claim_of_the_dead_that_another_has_taken_and_renewed_meanwhile(sessio
     assert storage.files(".batch/claims") == {}
 
 
+def test_a_claim_that_could_not_be_checked_is_given_back(session, storage, monkeypatch):
+    first, answers = session(), ["claims that were found"]
+    claims = first._claims
+
+    def ask(name):
+        if not answers:
+            raise OSError("no answer")
+        answers.pop()
+        return claims(name)
+
+    monkeypatch.setattr(first, "_claims", ask)
+    with pytest.raises(OSError, match="no answer"):
+        first.claim("a")
+    assert session().claim("a")
+
+
 def test_a_batch_of_another_machine_is_alive_for_a_while(session, storage):
     far, near = session(), session()
     assert far.claim("a")

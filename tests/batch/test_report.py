@@ -5,8 +5,11 @@ import io
 from html.parser import HTMLParser
 
 import pytest
+from rich.console import Console
 
+from splatart_ns.batch import progress, storage
 from splatart_ns.batch.entry import Entry
+from splatart_ns.batch.progress import LiveProgress
 from splatart_ns.batch.report import COLUMNS, Report
 from splatart_ns.batch.storage import open_storage
 
@@ -91,3 +94,14 @@ def test_counts_are_told(written):
     report, folder = written
     assert report.counts == {"done": 1, "failed": 1}
     assert "1 of 3 objects done, 1 failed, 1 unfinished." in (folder / "report.html").read_text()
+
+
+def test_a_report_that_cannot_be_written_meanwhile_is_written_at_the_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(progress, "_REPORT_EVERY", 0.0)
+    monkeypatch.setattr(storage, "_PAUSES", (0.0,))
+    out = open_storage(str(tmp_path / "file/out"))
+    (tmp_path / "file").touch()
+    with LiveProgress([Entry("a", "/captures/a")], out, Console(file=io.StringIO())) as told:
+        told.finished(0, row("a", status="failed", reason="why"))
+        (tmp_path / "file").unlink()
+    assert "why" in (tmp_path / "file/out/report.csv").read_text()
