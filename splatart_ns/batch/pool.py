@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from typing import IO, Any, Protocol
 
 from splatart_ns.batch.stage import Needs
@@ -161,6 +162,7 @@ class _Worker:
             self.process.kill()  # its files are whole, or its stage is repeated
             self.process.join()
             self._words.close()
+            Path(self._words.name).unlink(missing_ok=True)  # of a process that died before it could
         self.process = self.task = None
         self._tasks_left = 0
 
@@ -186,7 +188,7 @@ def _serve(pipe: Connection, words: str) -> None:
     """The process: run what comes through the pipe, until the other end closes it or dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that ends this one
     log = os.open(words, os.O_WRONLY | os.O_APPEND)
-    os.unlink(words)  # who started this has it open, and nothing is left, however both end
+    os.unlink(words)  # who started this has it open, and nothing is left, if it is killed
     for stream in (1, 2):
         os.dup2(log, stream)
     parent = multiprocessing.parent_process()

@@ -13,7 +13,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from splatart_ns.machine import CALM_THREADS, num_cores
@@ -72,6 +72,8 @@ class Companion:
     def end(self) -> None:
         self._process.kill()  # whatever it still does: its files are whole, or its run is repeated
         self._process.wait()
+        with suppress(OSError):  # it died before it was told all
+            self._process.stdin.close()
         self._process.stdout.close()
         self._words.close()
 

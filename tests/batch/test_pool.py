@@ -1,5 +1,6 @@
 """Processes of this machine."""
 
+import operator
 import os
 import threading
 import time
@@ -53,6 +54,15 @@ def test_a_process_leaves_no_file_behind_even_if_it_is_killed(pool, tmp_path, mo
     pool = pool(1, 1000, {})
     pool.start("a", Needs(), os.listdir, tmp_path)
     assert results(pool, 1) == {"a": []}
+
+
+def test_a_process_that_ends_before_it_can_serve_leaves_no_file_behind(pool, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("splatart_ns.batch.pool._serve", operator.is_)  # which does nothing, and returns
+    pool = pool(1, 1000, {})
+    pool.start("a", Needs(), abs, -1)
+    assert results(pool, 1)["a"] == Death("the process ended with exit code 0: no word")
+    assert os.listdir(tmp_path) == []
 
 
 def test_a_process_that_dies_takes_its_own_task_alone(pool):

@@ -87,6 +87,17 @@ def test_a_process_trains_one_run_after_the_other(configs):
     assert companion._process.returncode is not None
 
 
+def test_a_process_that_died_before_it_was_told_leaves_no_pipe_open(configs):
+    with Companions() as companions:
+        (companion,) = companions.first(1)
+        process = companion._process
+        process.kill()
+        process.wait()
+        with pytest.raises(RuntimeError, match="ended without a result"):
+            companion.train(configs[0], "auto", 1, lambda steps: None)
+    assert process.stdin.closed and process.stdout.closed
+
+
 def test_a_users_mistake_in_a_run_is_told_as_one(configs, tmp_path):
     (tmp_path / "capture/state_01/transforms.json").unlink()
     with pytest.raises(InputError):

@@ -7,6 +7,7 @@ freedoms. Libraries that are not installed raise ImportError.
 from __future__ import annotations
 
 import json
+import weakref
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -72,6 +73,7 @@ class PybulletModel:
 
         self._robot, self._pybullet = robot, pybullet
         self._client = pybullet.connect(pybullet.DIRECT)
+        weakref.finalize(self, pybullet.disconnect, self._client)  # also where the file cannot be loaded
         self._body = pybullet.loadURDF(str(path), useFixedBase=True, physicsClientId=self._client)
         count = pybullet.getNumJoints(self._body, physicsClientId=self._client)
         infos = [pybullet.getJointInfo(self._body, i, physicsClientId=self._client) for i in range(count)]

@@ -1,9 +1,12 @@
 """What is written is read by other programs, and every link is where the bundle says."""
 
 import dataclasses
+import gc
 import json
 import logging
+import sys
 import warnings
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -218,14 +221,30 @@ def test_a_warning_of_a_program_fails(objects, tmp_path, monkeypatch):
 
 
 def test_a_program_that_is_not_installed_is_said_to_be(objects, tmp_path, monkeypatch):
-    import sys
-
     monkeypatch.setitem(sys.modules, "mujoco", None)
     bundle = objects.chain(["revolute"])
     robot = objects.robot(bundle)
     found = report(validate(export(bundle, robot, "mjcf", tmp_path / "out"), "mjcf", bundle, robot))
     assert found["mujoco", "link poses"] == ("not checked", "pip install mujoco")
     assert not [v for v, _ in found.values() if v in ("failed", "passed")]
+
+
+@pytest.mark.parametrize("loads", [True, False])
+def test_every_server_of_pybullet_is_ended(objects, tmp_path, monkeypatch, loads):
+    """Of which a process may have 1024."""
+    client = 7
+
+    def load(path, **_):
+        if not loads:
+            raise RuntimeError("Cannot load URDF file.")
+
+    server = Mock(connect=Mock(return_value=client), loadURDF=load, getNumJoints=Mock(return_value=0))
+    monkeypatch.setitem(sys.modules, "pybullet", server)
+    bundle = objects.chain(["revolute"])
+    validate(tmp_path / "x.urdf", "urdf", bundle, objects.robot(bundle))
+    gc.collect()
+    server.connect.assert_called_once()
+    server.disconnect.assert_called_once_with(client)
 
 
 def test_pose_errors_are_relative_to_the_object(objects, tmp_path):
