@@ -197,7 +197,7 @@ def _export(work: Work, form: str) -> tuple[dict[str, Any], list[str]]:
     exports.require((form,))
     work.fetch("articulation.json", "parts")
     bundle = load_bundle(work.folder)
-    shapes = exports.part_shapes(bundle) if form != "ply" else None
+    shapes = exports.part_shapes(bundle) if form not in exports.WITHOUT_MESHES else None
     robot = exports.describe(bundle, shapes, work.entry.name.rsplit("/", 1)[-1])
     folder = work.folder / "export" / form
     path = exports.export(bundle, robot, form, folder)

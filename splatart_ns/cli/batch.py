@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from splatart_ns.cli.common import CONSOLE, Quality, Rasterizer
+from splatart_ns.cli.common import CONSOLE, Format, Quality, Rasterizer
 
 
 @dataclass
@@ -27,7 +27,7 @@ class Batch:
     """As in `splatart fit`."""
     seed: int = 0
     """As in `splatart fit`."""
-    export: tuple[Literal["urdf", "mjcf", "usd", "glb", "ply"], ...] = ()
+    export: tuple[Format, ...] = ()
     """Write these formats, too."""
     rasterizer: Rasterizer = "auto"
     """As in `splatart fit`."""

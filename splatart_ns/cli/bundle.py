@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, get_args
 
 import tyro
 
-from splatart_ns.cli.common import CONSOLE, Rasterizer, choose_rasterizer, device
+from splatart_ns.cli.common import CONSOLE, Format, Rasterizer, choose_rasterizer, device
 from splatart_ns.errors import InputError
 
 
@@ -65,7 +65,7 @@ class Export:
 
     bundle: Annotated[Path, tyro.conf.Positional]
     """Folder that `splatart fit` left."""
-    format: tuple[Literal["urdf", "mjcf", "usd", "glb", "ply", "html"], ...]
+    format: tuple[Format, ...]
     """One or more: urdf, mjcf (MuJoCo), usd (UsdPhysics), glb (a node a part, animated), ply (all Gaussians), html (a
     page with a slider for each joint, in one file)."""
     output: Path | None = None
@@ -86,7 +86,7 @@ class Export:
         exports.check_numbers(self.scale, self.density, self.limit_margin)
         formats = tuple(dict.fromkeys(self.format))
         if not formats:
-            raise InputError("--format is empty; give one or more of urdf, mjcf, usd, glb, ply, html.")
+            raise InputError(f"--format is empty; give one or more of {', '.join(get_args(Format))}.")
         # What cannot be written is said before the meshes are made.
         exports.require(formats)
         folders = {form: self.bundle / "export" / form if self.output is None else self.output for form in formats}

@@ -10,6 +10,7 @@ from rich.console import Console
 CONSOLE = Console(markup=False)  # paths and names may have brackets
 if not CONSOLE.is_terminal and "COLUMNS" not in os.environ:
     CONSOLE.width = 160  # files and pipes have no edge at which tables and sentences must break
+Format = Literal["urdf", "mjcf", "usd", "glb", "ply", "html"]
 Quality = Literal["draft", "standard", "high"]
 Rasterizer = Literal["auto", "torch", "numba", "gsplat"]
 

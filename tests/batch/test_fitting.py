@@ -7,10 +7,14 @@ import sys
 
 import pytest
 import torch
+from bundle_of_two import save_box
 
 from splatart_ns.batch import fitting
 from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.fitting import Fitting
+from splatart_ns.batch.stage import Work
+from splatart_ns.batch.storage import open_storage
+from splatart_ns.bundle import export
 
 SETTINGS = {"quality": "draft", "root": None, "seed": 0, "joints": []}
 
@@ -24,8 +28,8 @@ def fitted(hinge_capture, start_splatart, tmp_path_factory):
     image = folder / "captures/corrupt/state_01/images/0002.png"
     image.write_bytes(image.read_bytes()[:300])
     shutil.rmtree(folder / "captures/still/state_01")
-    arguments = ("batch", folder / "captures", "--output-dir", folder / "out", "--quality", "draft", "--export", "ply")
-    process = start_splatart(*arguments)
+    arguments = ("batch", folder / "captures", "--output-dir", folder / "out", "--quality", "draft")
+    process = start_splatart(*arguments, "--export", "ply", "html")
     process.told, process.errors = process.communicate()
     return folder, process
 
@@ -43,7 +47,7 @@ def test_the_bundle_is_that_of_a_single_fit_bit_for_bit(fitted, hinge_fit):
     assert (bundle / "articulation.json").read_bytes() == (hinge_fit / "articulation.json").read_bytes()
     for ply in (hinge_fit / "parts").iterdir():
         assert (bundle / "parts" / ply.name).read_bytes() == ply.read_bytes()
-    assert (bundle / "export/ply/export.json").exists()
+    assert (bundle / "export/ply/export.json").exists() and (bundle / "export/html/hinge.html").exists()
     ours, single = (json.loads((folder / "report.json").read_text()) for folder in (bundle, hinge_fit))
     for key in ("device", "rasterizer"):
         assert ours[key] == single[key]
@@ -83,7 +87,7 @@ def test_the_report_shows_two_pictures(fitted):
 def test_a_second_run_leaves_it_alone_and_says_the_same(fitted, run_main):
     folder, _ = fitted
     before = {file: file.stat().st_mtime_ns for file in (folder / "out/hinge").rglob("*") if file.is_file()}
-    arguments = ("--output-dir", folder / "out", "--quality", "draft", "--export", "ply")
+    arguments = ("--output-dir", folder / "out", "--quality", "draft", "--export", "ply", "html")
     code, told, _ = run_main("batch", folder / "captures", *arguments)
     assert code == 3 and "1 of 3 objects done, 2 failed" in told
     assert {file: file.stat().st_mtime_ns for file in before} == before
@@ -107,6 +111,16 @@ def test_nerfstudio_opens_the_runs_where_they_lie(fitted):
     run = folder / "out/hinge/runs/all/splatart-joint/fit"
     _, _, checkpoint, _ = eval_setup(run / "config.yml")
     assert checkpoint.parent.parent == run
+
+
+def test_a_page_of_a_bundle_takes_no_meshes(tmp_path, monkeypatch):
+    save_box(tmp_path / "out/box", seed=0)
+    monkeypatch.setattr(export, "part_shapes", None)
+    (tmp_path / "work").mkdir()
+    work = Work(Entry("box", ""), open_storage(str(tmp_path / "out")), tmp_path / "work")
+    outcome, kept = Fitting(exports=("html",)).run("export html", work)
+    assert outcome["failed_checks"] == [] and kept == ["export/html"]
+    assert (tmp_path / "work/export/html/box.html").exists()
 
 
 def stages(settings, told, **recipe):
