@@ -31,7 +31,7 @@ _THUMBNAIL = 96
 
 _TRAINED_ON = ("device", "rasterizer")
 """What the report says of the machine that trained; the one that finds the joints may have no GPU."""
-_CHECK = {"digest": str, "worlds": str, "states": [{"name": str, "digest": str, "pixels": int}]}
+_CHECK = {"digest": str, "worlds": str, "downscale": int, "states": [{"name": str, "digest": str, "pixels": int}]}
 _TRAINING = {"seconds": NUMBER, "notes": [str]}
 _POSE = _TRAINING | dict.fromkeys(_TRAINED_ON, str)
 _EXPORT = {"failed_checks": [str], "notes": [str]}
@@ -55,11 +55,12 @@ class Fitting:
 
     def stages(self, entry: Entry, fingerprint: str, told: dict[str, Any] | None) -> list[Stage]:
         package, settings = version("splatart-ns"), entry.settings
-        fitting = [settings["quality"], settings["seed"], self.rasterizer]
         last = [settings["root"], settings["joints"]]
-        check = Stage("check", stage_key("check", package, fingerprint, last))
+        check = Stage("check", stage_key("check", package, fingerprint, settings["quality"], last))
         if told is None:
             return [check]
+        # How much smaller all states' images are looked at, the smallest image of any of them decides.
+        fitting = [settings["quality"], settings["seed"], self.rasterizer, told["downscale"]]
 
         def needs(pixels: int) -> Needs:
             return Needs(memory_mb=_BASE_MB + pixels * _BYTES_PER_PIXEL // 2**20, gpu=True)
@@ -124,7 +125,7 @@ class Fitting:
 def _check(work: Work, settings: Settings) -> dict[str, Any]:
     """Whether the capture can be fitted, what it is, and how much of it there is to hold in memory."""
     from splatart_ns.capture.digest import capture_digest
-    from splatart_ns.plugin.fit import require_fittable
+    from splatart_ns.plugin.fit import image_downscale, require_fittable
 
     with work.capture() as path:
         capture = require_fittable(path, settings)
@@ -132,6 +133,7 @@ def _check(work: Work, settings: Settings) -> dict[str, Any]:
         return {
             "digest": capture_digest(capture),
             "worlds": capture.worlds,
+            "downscale": image_downscale(capture, settings.quality),
             "states": [
                 {
                     "name": state.name,

@@ -301,7 +301,7 @@ def _placed(
     """With its capture, its run folder, and none of what `ns-train` shows and saves meanwhile."""
     config.data = capture.path.absolute()
     config.pipeline.datamanager.data = config.data
-    config.pipeline.datamanager.camera_res_scale_factor = 1 / _downscale(capture, EFFORTS[settings.quality])
+    config.pipeline.datamanager.camera_res_scale_factor = 1 / image_downscale(capture, settings.quality)
     config.pipeline.datamanager.dataparser.data = config.data
     config.pipeline.datamanager.dataparser.state = state
     config.pipeline.datamanager.dataparser.worlds = settings.worlds
@@ -319,11 +319,11 @@ def _placed(
     return config
 
 
-def _downscale(capture: Capture, effort: Effort) -> int:
+def image_downscale(capture: Capture, quality: Quality) -> int:
     """How many times smaller than they are the images of all states are looked at."""
     cameras = [frame.camera for state in capture.states for frame in state.frames]
     least = min(min(camera.width, camera.height) for camera in cameras)
-    return max(1, min(effort.downscale, least // SMALLEST))
+    return max(1, min(EFFORTS[quality].downscale, least // SMALLEST))
 
 
 def _config_file(config: TrainerConfig) -> Path:

@@ -15,6 +15,8 @@ from splatart_ns.batch.fitting import Fitting
 from splatart_ns.batch.stage import Work
 from splatart_ns.batch.storage import open_storage
 from splatart_ns.bundle import export
+from splatart_ns.capture.procedural import synthesize_object
+from splatart_ns.capture.synthesis_options import SynthesisOptions
 
 SETTINGS = {"quality": "draft", "root": None, "seed": 0, "joints": []}
 
@@ -127,9 +129,30 @@ def stages(settings, told, **recipe):
     return {stage.name: stage for stage in Fitting(**recipe).stages(Entry("a", "", SETTINGS | settings), "files", told)}
 
 
+def test_smaller_images_of_one_state_train_the_others_anew(hinge_capture, tmp_path, monkeypatch):
+    """Where they are too small to be looked at half as large, as those of all states are."""
+    monkeypatch.setattr("splatart_ns.plugin.fit.SMALLEST", 30)
+    shutil.copytree(hinge_capture, tmp_path / "capture")
+    entry = Entry("hinge", str(tmp_path / "capture"), SETTINGS)
+
+    def checked():
+        told, _ = Fitting().run("check", Work(entry, open_storage(str(tmp_path)), tmp_path / "work"))
+        return told, {stage.name: stage.key for stage in Fitting().stages(entry, "files", told)}
+
+    before, keys = checked()
+    small = synthesize_object(
+        "hinge", tmp_path / "small", SynthesisOptions(train_views=12, test_views=2, resolution=32)
+    )
+    shutil.rmtree(tmp_path / "capture/state_01")
+    shutil.copytree(small / "state_01", tmp_path / "capture/state_01")
+    after, new_keys = checked()
+    assert before["states"][0] == after["states"][0] and (before["downscale"], after["downscale"]) == (2, 1)
+    assert keys["semantic state_00"] != new_keys["semantic state_00"]
+
+
 def test_what_depends_on_a_setting_or_a_state_has_another_key():
     states = [{"name": n, "digest": n, "pixels": 10**6} for n in ("s0", "s1")]
-    told = {"digest": "all", "worlds": "shared", "states": states}
+    told = {"digest": "all", "worlds": "shared", "downscale": 1, "states": states}
     other_state = told | {"digest": "new", "states": [states[0], states[1] | {"digest": "new"}]}
     first = stages({}, told, exports=("urdf",))
 
@@ -144,6 +167,8 @@ def test_what_depends_on_a_setting_or_a_state_has_another_key():
     apart = told | {"worlds": "similar"}
     assert changed({"root": "lid"}, apart, stages({}, apart, exports=("urdf",))) == last | {"check", "pose"}
     assert changed({"seed": 1}, told) == last | {"semantic s0", "semantic s1", "pose"}
+    assert changed({}, told | {"downscale": 2}) == last | {"semantic s0", "semantic s1", "pose"}
+    assert changed({"quality": "high"}, told) == set(first)
     assert changed({}, other_state) == last | {"semantic s1", "pose"}
     assert first["pose"].after == ("semantic s0", "semantic s1") and first["semantic s0"].after == ("check",)
     assert first["semantic s0"].needs.gpu and not first["joint"].needs.gpu
