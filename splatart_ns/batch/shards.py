@@ -23,9 +23,14 @@ from splatart_ns.errors import InputError
 if TYPE_CHECKING:
     from splatart_ns.bundle.dataset import Dataset, Sample
 
-_NEEDS_MB = 1500
+_BASE_MB = 1500
+"""Memory of a process that has loaded the libraries, and of a bundle."""
+_BYTES_PER_PIXEL = 100
+"""Memory of a pixel of the image that is being made."""
 _ARTICULATION = "articulation.json"
 _IMAGES = "images.tar"
+_SUFFIXES = ("rgb.png", "parts.png", "depth.png", "json")
+"""Of a sample's files, as WebDataset's decoders know them, in their order."""
 
 
 @dataclass(frozen=True)
@@ -110,13 +115,14 @@ class Sharding:
         return stage_key([(name, _stamps(source, name)) for name in entry.settings["bundles"]])
 
     def stages(self, entry: Entry, fingerprint: str, told: dict[str, Any] | None) -> list[Stage]:
-        package, needs = version("splatart-ns"), Needs(memory_mb=_NEEDS_MB)
-        read = Stage("read", stage_key("read", package, fingerprint), needs=needs)
+        package = version("splatart-ns")
+        read = Stage("read", stage_key("read", package, fingerprint), needs=Needs(memory_mb=_BASE_MB))
         if told is None:
             return [read]
         options = {key: value for key, value in asdict(self.options).items() if key not in ("images", "shard_size")}
         key = stage_key("images", package, told["digest"], entry.settings, options, self.rasterizer)
-        return [read, Stage("images", key, ("read",), Needs(memory_mb=_NEEDS_MB, gpu=True))]
+        memory = _BASE_MB + self.options.resolution**2 * _BYTES_PER_PIXEL // 2**20
+        return [read, Stage("images", key, ("read",), Needs(memory_mb=memory, gpu=True))]
 
     def run(self, stage: str, work: Work) -> tuple[dict[str, Any], Sequence[str]]:
         if stage == "read":
@@ -140,18 +146,25 @@ class Sharding:
     def _write(self, work: Work, path: Path) -> list[str]:
         """The shard, and its first pictures for the report."""
         first, count, total = (work.entry.settings[key] for key in ("first", "count", "of"))
-        samples: dict[int, dict[str, bytes]] = {}
+        # Made bundle by bundle, kept image by image: they wait in files, for all of a shard may not fit in memory.
+        waiting = work.folder.parent / "samples"
+        waiting.mkdir(exist_ok=True)
         for place, name in enumerate(work.entry.settings["bundles"]):
             dataset, title = self._dataset(work, name), name or work.entry.capture.rsplit("/", 1)[-1]
             for image in range(first + place, first + count, total):
-                samples[image] = _encode(dataset, dataset[image // total], title)
+                for suffix, data in _encode(dataset, dataset[image // total], title).items():
+                    (waiting / f"{image:09d}.{suffix}").write_bytes(data)
+        pictures = [_thumbnail(waiting / f"{image:09d}.rgb.png") for image in range(first, first + min(count, 2))]
         with tarfile.open(path, "w") as tar:
-            for image in sorted(samples):
-                for suffix, data in samples[image].items():
-                    about = tarfile.TarInfo(f"{image:09d}.{suffix}")  # no time and no owner: the same bytes each time
-                    about.size = len(data)
-                    tar.addfile(about, io.BytesIO(data))
-        return [_thumbnail(samples[image]["rgb.png"]) for image in range(first, first + min(count, 2))]
+            for image in range(first, first + count):
+                for suffix in _SUFFIXES:
+                    file = waiting / f"{image:09d}.{suffix}"
+                    about = tarfile.TarInfo(file.name)  # no time and no owner: the same bytes each time
+                    about.size = file.stat().st_size
+                    with open(file, "rb") as data:
+                        tar.addfile(about, data)
+                    file.unlink()
+        return pictures
 
     def _dataset(self, work: Work, name: str) -> Dataset:
         from splatart_ns.bundle import load
@@ -187,7 +200,7 @@ def _digest(work: Work) -> str:
 
 
 def _encode(dataset: Dataset, sample: Sample, name: str) -> dict[str, bytes]:
-    """A sample's files by their suffixes, as WebDataset's decoders know them."""
+    """A sample's files by their suffixes."""
     import cv2
     import numpy as np
 
@@ -214,12 +227,12 @@ def _encode(dataset: Dataset, sample: Sample, name: str) -> dict[str, bytes]:
     }
 
 
-def _thumbnail(png: bytes) -> str:
+def _thumbnail(png: Path) -> str:
     import base64
 
     from PIL import Image
 
-    image = Image.open(io.BytesIO(png))
+    image = Image.open(png)
     white = Image.new("RGBA", image.size, "white")
     data = io.BytesIO()
     Image.alpha_composite(white, image).convert("RGB").resize((96, 96)).save(data, "JPEG", quality=80)

@@ -12,10 +12,13 @@ from bundle_of_two import save_box
 from PIL import Image
 from rich.console import Console
 
+from splatart_ns.batch import shards
 from splatart_ns.batch.batch import run_batch
 from splatart_ns.batch.command import write_shards
+from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.pool import ProcessPool
 from splatart_ns.batch.shards import Sharding, ShardOptions, Shards, check_no_others, find_bundles
+from splatart_ns.batch.stage import Work
 from splatart_ns.batch.storage import open_storage
 from splatart_ns.errors import InputError
 
@@ -90,6 +93,39 @@ def test_shards_hold_labelled_images_and_one_can_be_made_again_alone(bundles, ma
     assert {name for name, _ in again.stages} == {"shard-000001"}
     assert (out / "shard-000001/images.tar").read_bytes() == before
     assert (out / "shard-000000/images.tar").stat().st_mtime_ns == other
+
+
+class Counted(bytes):
+    """Of which it is known how many there were at once."""
+
+    now = most = 0
+
+    def __new__(cls, data):
+        cls.now += 1
+        cls.most = max(cls.now, cls.most)
+        return super().__new__(cls, data)
+
+    def __del__(self):
+        Counted.now -= 1
+
+
+def test_samples_of_a_shard_are_not_all_in_memory_at_once(bundles, tmp_path, monkeypatch):
+    encode = shards._encode
+    monkeypatch.setattr(shards, "_encode", lambda *given: {k: Counted(v) for k, v in encode(*given).items()})
+    options = replace(OPTIONS, images=30, shard_size=30, resolution=8)
+    (tmp_path / "bundle").mkdir()
+    (entry,) = Shards(str(bundles), ["a", "c"], options)
+    Sharding(options, "torch").run("images", Work(entry, open_storage(str(tmp_path / "out")), tmp_path / "bundle"))
+    assert list(members(tmp_path / "bundle/images.tar"))[::4] == [f"{image:09d}.rgb.png" for image in range(30)]
+    assert Counted.most <= 8  # files of two samples
+
+
+def test_larger_images_need_more_memory():
+    small, large = (
+        Sharding(ShardOptions(images=10, resolution=side)).stages(Entry("a", "", {}), "files", {"digest": ""})[1]
+        for side in (256, 8192)
+    )
+    assert small.needs.memory_mb < 2000 and large.needs.memory_mb > 5000
 
 
 def test_one_bundle_is_enough(bundles, make, tmp_path):
