@@ -42,8 +42,7 @@ class Carving:
     size: float
     """Side of a voxel."""
     accepted: Tensor
-    """Whether view v lets a voxel be inside, bool [V, X, Y, Z]. A point beyond an image's border is not, unless the
-    silhouette is cut off there."""
+    """Whether view v lets a voxel be inside, bool [V, X, Y, Z] (see `admitted`)."""
     seen: Tensor
     """Whether a voxel falls into an image at all, bool [X, Y, Z]."""
 
@@ -57,11 +56,7 @@ class Carving:
 
     def missing(self, view: View, hull: Tensor) -> Tensor:
         """The pixels [H, W] of a view's silhouette that none of the voxels `hull` [N, 3] projects to."""
-        mask = silhouette(view)
-        column, row, _, visible = project(view, hull)
-        hit = torch.zeros_like(mask)
-        hit[row[visible], column[visible]] = True
-        return mask & ~widened(hit, footprint(view, self.size))
+        return missing(view, silhouette(view), hull, footprint(view, self.size))
 
     def uncovered(self, views: Tensor) -> Tensor:
         """The share of each view's silhouette [V] that the hull of `views` (bool [V]) misses; 0 for the other views."""
@@ -76,18 +71,13 @@ def carve(views: Sequence[View]) -> Carving:
     """Carve a box around all that 3 of 4 views agree on. Every view needs a silhouette that is not empty."""
     low, high = torch.full((3,), -REACH), torch.full((3,), REACH)
     for count in (_COARSE, _FINE):
-        size = float((high - low).max()) / count
-        axes = [torch.arange(float(a) + size / 2, float(b), size) for a, b in zip(low, high, strict=True)]
-        points = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+        points, size = voxel_grid(low, high, count)
         accepted = torch.zeros(len(views), *points.shape[:3], dtype=torch.bool)
         seen = torch.zeros(points.shape[:3], dtype=torch.bool)
         for i, view in enumerate(views):
-            mask = silhouette(view)
-            border = torch.cat([*mask[[0, -1]], *mask[:, [0, -1]].T])
-            column, row, _, visible = project(view, points.reshape(-1, 3))
-            mask = widened(mask, footprint(view, size))
-            accepted[i] = torch.where(visible, mask[row, column], border.any()).reshape(seen.shape)
-            seen |= visible.reshape(seen.shape)
+            lets, inside = admitted(view, silhouette(view), points.reshape(-1, 3), footprint(view, size))
+            accepted[i] = lets.reshape(seen.shape)
+            seen |= inside.reshape(seen.shape)
         full = (accepted.sum(0) >= (1 - _MOST_ODD) * len(views)) & seen
         if not full.any():
             break
@@ -132,11 +122,40 @@ def _blame(carving: Carving, views: Tensor) -> Tensor:
     near = (times > 0) & (times <= max(1, _MOST_ODD * len(rejected))) & carving.seen
     wanted, hull = torch.zeros(int(near.sum())), carving.points[carving.inside(views)]
     for i in torch.nonzero(views).flatten().tolist():
-        column, row, _, visible = project(carving.views[i], carving.points[near])
-        wanted += visible & carving.missing(carving.views[i], hull)[row, column]
+        column, row, _, inside = project(carving.views[i], carving.points[near])
+        wanted += inside & carving.missing(carving.views[i], hull)[row, column]
     blame = torch.zeros(len(views))
     blame[views] = (rejected[:, near] * (wanted / times[near] ** 2)).sum(1)
     return blame
+
+
+def voxel_grid(low: Tensor, high: Tensor, count: int) -> tuple[Tensor, float]:
+    """Centres [X, Y, Z, 3] of voxels that fill the box from `low` to `high` [3], `count` along its longest side, and
+    their size."""
+    size = float((high - low).max()) / count
+    axes = [torch.arange(float(a) + size / 2, float(b), size) for a, b in zip(low, high, strict=True)]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1), size
+
+
+def admitted(view: View, mask: Tensor, points: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+    """Which points [N, 3] a view's silhouette `mask` [H, W], widened by `reach` pixels, lets be inside the object, and
+    which fall into the image: [N] bool each.
+
+    A point beyond the image's border is outside, unless the silhouette is cut off by the border: then the view says
+    nothing of it.
+    """
+    border = torch.cat([*mask[[0, -1]], *mask[:, [0, -1]].T])
+    column, row, _, inside = project(view, points)
+    return torch.where(inside, widened(mask, reach)[row, column], border.any()), inside
+
+
+def missing(view: View, mask: Tensor, hull: Tensor, reach: int) -> Tensor:
+    """The pixels [H, W] of a view's silhouette `mask` [H, W] that have none within `reach` to which one of the voxels
+    `hull` [N, 3] projects."""
+    column, row, _, inside = project(view, hull)
+    hit = torch.zeros_like(mask)
+    hit[row[inside], column[inside]] = True
+    return mask & ~widened(hit, reach)
 
 
 def outermost(full: Tensor) -> Tensor:

@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from splatart_ns.capture.capture import UNLABELLED
-from splatart_ns.capture.hull import footprint, outermost, project, visible, widened
+from splatart_ns.capture.capture import REACH, UNLABELLED
+from splatart_ns.capture.hull import admitted, footprint, missing, outermost, project, visible, voxel_grid
 from splatart_ns.capture.seen_surface import SeenSurface, measured_surface
 from splatart_ns.capture.view import View
 from splatart_ns.stages.stereo import stereo_surface
@@ -34,6 +34,8 @@ all of them hollows fill up."""
 BESIDE = 2
 """Voxels around a surface that is found where nothing else starts."""
 SLACKS = (2, 4, 6, 9, 13)
+COARSE, FINE = 48, 96
+"""Voxels along the longest side, of the box of all objects and of the object's own."""
 UNCOVERED = 0.005
 """A hull fills silhouettes if it misses no more than this share of them. Of exact cameras it missed none; of cameras
 that were half a degree and half a percent off, with thin parts, half."""
@@ -87,9 +89,8 @@ EXACT = Slack()
 def carve(views: Sequence[View], grid: Tensor, dilate: int, erring: int = 0) -> Tensor:
     """Which points [N, 3] lie inside every silhouette but `erring` ones, and are seen at all: [N] bool.
 
-    A point beyond an image's border counts as outside, unless the silhouette is cut off by the border: then that view
-    says nothing of it. Nor does one with an empty silhouette, which would leave no point at all. `dilate` widens the
-    silhouettes by so many pixels. If views may err, what is `FAINT` counts.
+    Beyond an image's border see `admitted`. A view with an empty silhouette, which would leave no point at all, says
+    nothing. `dilate` widens the silhouettes by so many pixels. If views may err, what is `FAINT` counts.
     """
     left = torch.arange(len(grid))
     seen, missed = torch.zeros(len(grid), dtype=torch.bool), torch.zeros(len(grid), dtype=torch.int32)
@@ -97,12 +98,11 @@ def carve(views: Sequence[View], grid: Tensor, dilate: int, erring: int = 0) -> 
         silhouette = view.alpha > (FAINT if erring else 127)
         if not silhouette.any():
             continue
-        border = torch.cat([*silhouette[[0, -1]], *silhouette[:, [0, -1]].T])
-        column, row, _, visible = project(view, grid[left])
-        missed += ~torch.where(visible, widened(silhouette, dilate)[row, column], border.any())
+        lets, inside = admitted(view, silhouette, grid[left], dilate)
+        missed += ~lets
         # Most points fall to the first few views; the others need not look at them.
         stays = missed <= erring
-        left, seen, missed = left[stays], (seen | visible)[stays], missed[stays]
+        left, seen, missed = left[stays], (seen | inside)[stays], missed[stays]
     return torch.zeros(len(grid), dtype=torch.bool).index_fill_(0, left[seen], True)
 
 
@@ -121,30 +121,25 @@ def slack(views: Sequence[View]) -> tuple[Slack, Hull | None]:
 
 def _uncovered(views: Sequence[View], voxels: Tensor, size: float) -> float:
     """The share of the silhouettes that no voxel projects to."""
-    missing, total = 0.0, 0.0
+    missed, total = 0.0, 0.0
     for view in views:
         silhouette = view.alpha > 127
-        column, row, _, visible = project(view, voxels)
-        hit = torch.zeros_like(silhouette)
-        hit[row[visible], column[visible]] = True
-        missing += float((silhouette & ~widened(hit, max(1, footprint(view, size)))).sum())
+        missed += float(missing(view, silhouette, voxels, max(1, footprint(view, size))).sum())
         total += float(silhouette.sum())
-    return missing / max(total, 1.0)
+    return missed / max(total, 1.0)
 
 
-def visual_hull(views: Sequence[View], resolution: int = 96, slack: Slack = EXACT) -> Hull | None:
+def visual_hull(views: Sequence[View], slack: Slack = EXACT) -> Hull | None:
     """The voxels inside all silhouettes, but for what `slack` allows; None when no voxel is occupied.
 
-    Two passes: a coarse one finds the object's box, a fine one of `resolution` voxels along the longest side fills it.
+    Two passes: a coarse one finds the object's box, a fine one fills it. Silhouettes are widened by a voxel's
+    `footprint`, in the fine pass by half of it.
     """
-    low, high = torch.full((3,), -1.5), torch.full((3,), 1.5)
-    for count in (48, resolution):
-        size = float((high - low).max()) / count
-        axes = [torch.arange(float(a) + size / 2, float(b), size) for a, b in zip(low, high, strict=True)]
-        grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
-        # Half a voxel's diagonal in pixels, so that no thin part falls between the voxel centres.
-        pixels = max(float(v.K[0, 0] / v.viewmat[:3, 3].norm().clamp_min(0.1)) for v in views) * size * 0.87
-        dilate = slack.pixels + round(pixels if count != resolution else pixels / 2)
+    low, high = torch.full((3,), -REACH), torch.full((3,), REACH)
+    for count, share in ((COARSE, 1.0), (FINE, 0.5)):
+        grid, size = voxel_grid(low, high, count)
+        grid = grid.reshape(-1, 3)
+        dilate = slack.pixels + max(footprint(view, share * size) for view in views)
         grid = grid[carve(views, grid, dilate, slack.views)]
         if len(grid) == 0:
             return None
@@ -264,8 +259,8 @@ def _mean_colours(views: Sequence[View], points: Tensor) -> Tensor:
     """Mean colour [N, 3], 0..255, over the views in whose silhouette a point falls; grey where there is none."""
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
     for view in views:
-        column, row, _, visible = project(view, points)
-        inside = (visible & (view.alpha[row, column] > 127)).float()[:, None]
-        total += inside * view.rgb[row, column].float()
-        weight += inside
+        column, row, _, inside = project(view, points)
+        shown = (inside & (view.alpha[row, column] > 127)).float()[:, None]
+        total += shown * view.rgb[row, column].float()
+        weight += shown
     return torch.where(weight > 0, total / weight.clamp_min(1), torch.full_like(total, 127.5))

@@ -101,7 +101,7 @@ def test_some_frames_may_lack_a_depth(views):
     found = measured_surface(half)
     assert len(found.xyz) > 400 and found.confirmed > 0.9
     assert [view.depth is None for view in found.trusted_views()] == [k % 2 == 1 for k in range(len(views))]
-    voxels, size = visual_hull(half, resolution=32)
+    voxels, size = visual_hull(half)
     at_surface = (voxels.norm(dim=-1) - RADIUS).abs() < size
     assert found.judged(voxels[at_surface], size)[1].median() < 0.2  # blank in few of those that have a depth
 
@@ -115,7 +115,7 @@ def test_a_single_depth_is_not_believed_and_two_are(views, count, finds):
 
 
 def test_gaussians_start_on_what_is_measured(views):
-    hull = visual_hull(views, resolution=32)
+    hull = visual_hull(views)
     points = seed_points(views, 1, 1000, torch.Generator().manual_seed(0), hull, seen_surface(views, *hull))
     assert (points.xyz.norm(dim=-1) - RADIUS).abs().quantile(0.9) < 0.01
     assert (points.normals.norm(dim=-1) > 0).float().mean() > 0.7

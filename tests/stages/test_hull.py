@@ -23,6 +23,7 @@ from splatart_ns.stages.hull import (
 SIZE = (0.9, 0.6, 0.3)
 BASE, KNOB = box(1, SIZE, (0.0, 0.0, -0.1)), box(2, (0.16, 0.16, 0.16), (0.0, 0.0, 0.3), spacing=0.04)
 VIEWS = photograph(Splat.cat([BASE, KNOB]), count=14)
+HULL = visual_hull(VIEWS)
 
 
 def started(views, count, voxels, seed: int = 0):
@@ -30,16 +31,22 @@ def started(views, count, voxels, seed: int = 0):
 
 
 def seeds(seed: int = 0):
-    return started(VIEWS, 500, visual_hull(VIEWS, resolution=40), seed)
+    return started(VIEWS, 500, HULL, seed)
 
 
 def test_the_hull_holds_the_object_and_little_more():
-    voxels, size = visual_hull(VIEWS, resolution=40)
+    voxels, size = HULL
     inside = (voxels - torch.tensor([0.0, 0.0, -0.1])).abs() <= torch.tensor(SIZE) / 2 - 2 * size
     box_volume = SIZE[0] * SIZE[1] * SIZE[2]
     assert inside.all(-1).any()
     assert 0.8 * box_volume < len(voxels) * size**3 < 3.5 * box_volume  # the images are small
     assert (voxels.norm(dim=-1) < 0.9).all()
+
+
+def test_a_rod_thinner_than_the_voxels_does_not_fall_between_their_centres():
+    rod = box(1, (0.8, 0.02, 0.02), (0.0, 0.0, 0.0), spacing=0.02)
+    voxels, size = visual_hull(photograph(rod, 14, 160))
+    assert torch.cdist(rod.means, voxels).amin(1).max() < size
 
 
 def test_what_no_view_sees_or_one_view_sees_through_is_carved():
@@ -76,7 +83,7 @@ def test_a_small_part_gets_its_least_number_of_points():
     labels, _ = likely_parts(VIEWS, seeds().xyz, 0.03, 2)  # of 500 points, 250 each: it has a fortieth of the volume
     assert (labels == 2).sum() > 0.8 * 250
     fine = photograph(Splat.cat([BASE, KNOB]), count=6, pixels=240)
-    points = started(fine, 4000, visual_hull(fine, resolution=40))
+    points = started(fine, 4000, visual_hull(fine))
     labels, _ = likely_parts(fine, points.xyz, 0.03, 2)
     assert 0.8 * MIN_POINTS_PER_PART[2] < (labels == 2).sum() < 1.5 * MIN_POINTS_PER_PART[2]
 
@@ -109,7 +116,7 @@ def test_the_outermost_voxels_lack_a_neighbour():
 
 
 def test_where_stereo_finds_nothing_half_of_the_points_start_on_the_hulls_surface_and_half_anywhere():
-    voxels, size = visual_hull(VIEWS, resolution=40)
+    voxels, size = HULL
     # Plain, and no part is filled up.
     silent = [replace(view, rgb=torch.full_like(view.rgb, 99), labels=None) for view in VIEWS]
     points = started(silent, 3000, (voxels, size)).xyz
@@ -123,13 +130,12 @@ def test_where_stereo_finds_nothing_half_of_the_points_start_on_the_hulls_surfac
 
 def test_small_silhouettes_get_fewer_points():
     pixels = sum(float((view.alpha > 127).sum()) for view in VIEWS) / len(VIEWS)
-    hull = visual_hull(VIEWS, resolution=40)
-    points = [started(VIEWS, n, hull) for n in (20000, 40000)]
+    points = [started(VIEWS, n, HULL) for n in (20000, 40000)]
     assert len(points[0].xyz) == len(points[1].xyz)
     enough = POINTS_PER_PIXEL * pixels + POINTS_PER_PART * 2
     assert enough - 1 < len(points[0].xyz) < 2 * enough  # and the small part's
     far = photograph(Splat.cat([BASE, KNOB]), count=14, pixels=24)
-    less = started(far, 20000, hull)
+    less = started(far, 20000, HULL)
     assert len(less.xyz) < 0.7 * len(points[0].xyz)
 
 

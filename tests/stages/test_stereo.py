@@ -63,7 +63,7 @@ def views() -> list[View]:
 
 @pytest.fixture(scope="module")
 def hull(views):
-    return visual_hull(views, resolution=48)
+    return visual_hull(views)
 
 
 def outer(hull):
