@@ -164,6 +164,14 @@ def test_what_no_camera_looked_at_is_told():
     assert unseen["above"] == pytest.approx(bottom, abs=0.05)
 
 
+def test_the_back_of_a_thin_plate_is_not_seen_through_its_front():
+    splat = splat_on(trimesh.creation.box((1, 0.6, 0.01)), 5000)
+    ring = torch.tensor([[math.cos(a), math.sin(a), 0.0] for a in torch.arange(0, 2 * math.pi, 0.3)])
+    above = torch.cat([5 * ring + torch.tensor([0, 0, z]) for z in (2.0, 4.0, 8.0)])
+    mesh = part_surface(splat, above, voxels=VOXELS)
+    assert mesh.metadata["unseen_share"] == pytest.approx(0.5, abs=0.05)
+
+
 @pytest.mark.parametrize(
     "splat",
     [

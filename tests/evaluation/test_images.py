@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatart_ns.bundle import configured_motions, normalized, observed_motions
+from splatart_ns.bundle import configured_motions, joint_motion, normalized, observed_motions
 from splatart_ns.capture.capture import Capture, Normalization
 from splatart_ns.capture.view import View
 from splatart_ns.evaluation.images import image_scores, is_mapped, mapped_value, novel_motions, part_overlap, psnr
@@ -68,6 +68,13 @@ def test_a_perfect_estimate_goes_where_the_truth_goes(truth, bundle, flip):
     motions = novel_motions(bundle, truth, truth.novel[0])
     for part in bundle.parts:
         torch.testing.assert_close(motions[part.name], truth.novel[0].motions[part.id])
+
+
+def test_a_joint_on_another_parent_goes_as_far_as_the_true_one_of_its_child(truth, bundle):
+    slide = bundle.joints[1]
+    slide.parent = "body"
+    motions = novel_motions(bundle, truth, truth.novel[0])
+    torch.testing.assert_close(motions["latch"], joint_motion(slide, truth.novel[0].values["slide"]))
 
 
 def test_the_root_moves_as_the_truth_says(truth, bundle):

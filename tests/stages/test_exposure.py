@@ -5,7 +5,7 @@ import torch
 from part_scene import box, photograph
 
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.exposure import at_gain, frame_gains, unevenness
+from splatart_ns.stages.exposure import FRAMES, at_gain, frame_gains, unevenness
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +61,13 @@ def test_frames_that_differ_by_chance_are_uneven(scene):
     logs = 0.15 * torch.randn(len(views), 3, generator=torch.Generator().manual_seed(0))
     for count in (10, 20):
         assert unevenness(logs[:count].exp(), views[:count]) == pytest.approx(0.15, rel=0.25)
+
+
+def test_of_few_frames_what_the_direction_of_view_takes_up_by_chance_counts(scene):
+    views = (2 * scene[1])[:FRAMES]
+    logs = 0.15 * torch.randn(200, FRAMES, 3, generator=torch.Generator().manual_seed(0))
+    found = torch.tensor([unevenness(gains.exp(), views) for gains in logs])
+    assert float(found.mean()) == pytest.approx(0.15, rel=0.1)
 
 
 def test_light_from_one_side_does_not_make_frames_uneven(scene):

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -119,3 +120,17 @@ def test_equations_after_a_converged_step_are_those_measured_there(turned):
     assert found.converged and found.cost == pytest.approx(again.cost)
     covariance, measured = (motion_covariance(turned, found.T, r.equations) for r in (found, again))
     assert torch.linalg.norm(covariance - measured) < 0.2 * torch.linalg.norm(measured)
+
+
+def test_a_motion_that_two_directions_disagree_about_is_less_certain(turned):
+    equations = refine(turned, TURN, max_iterations=0).equations
+    counts = [len(views) for views in reversed(turned.views)]
+    # As far from their mean, view by view.
+    alike = torch.tensor([1.0, -1.0]).repeat(sum(counts) // 2)
+    apart = torch.tensor([1.0, -1.0]).repeat_interleave(torch.tensor(counts))
+    pull = equations.H.sum(0).diagonal().mean().sqrt()
+    agreed, disagreed = (
+        motion_covariance(turned, TURN, replace(equations, g=pull * ways[:, None].expand(-1, 6).double()))
+        for ways in (alike, apart)
+    )
+    assert disagreed.trace() > 2 * agreed.trace()

@@ -12,6 +12,7 @@ from splatart_ns.stages import world
 from splatart_ns.stages.render_choice import initial_motion
 from splatart_ns.stages.visibility import visibility
 from splatart_ns.stages.world import (
+    WorldFit,
     anchors,
     fit_world,
     fit_worlds,
@@ -61,6 +62,17 @@ def test_a_world_of_another_scale_is_to_be_brought_together_with_its_scale(with_
     part, (found,) = fit_worlds(splats, views, seen, [1, 2], with_scale)
     sentence = world_sentence(world_record("state_01", f"part {part}", found.T, found), "state_00")
     assert words in sentence if words else "fit badly" not in sentence
+
+
+def test_a_record_says_how_certain_scale_and_turn_are_in_their_own_units():
+    M = motion((0, 30, 0), (1, 2, 3))
+    T = similarity(2.0, M[:3, :3], M[:3, 3])
+    deviations = torch.tensor([9.0, 9.0, 9.0, 0.01, 0.02, 0.02, 0.005], dtype=torch.float64)
+    record = world_record("state_01", "body", T, WorldFit(T, deviations.square().diag(), ratio=1.0))
+    assert record["scale"] == pytest.approx(2) and record["scale_deviation"] == pytest.approx(0.01)
+    assert record["turn_deviation_degrees"] == pytest.approx(math.degrees(0.03))
+    sentence = world_sentence(record, "state_00")
+    assert "scale 2.00000 +- 0.01000, turned by 30.00 +- 1.72 deg" in sentence
 
 
 def turned_over(monkeypatch):
