@@ -41,7 +41,8 @@ def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> l
     """`function` of every item, in the items' order, on `num_threads` threads at a time.
 
     Within `function` torch and the rasterizer have one thread each, and gradients are recorded. The results do not
-    depend on the number of threads.
+    depend on the number of threads. With CUDA the items follow each other in the calling thread, and torch and the
+    rasterizer have the threads they had.
     """
     threads, of_torch = num_threads(), torch.get_num_threads()
     if threads == 1 or torch.cuda.is_available():

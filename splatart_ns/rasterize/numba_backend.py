@@ -37,8 +37,8 @@ def rasterize_to_pixels(
 ) -> tuple[Tensor, Tensor]:
     """Composite projected Gaussians front to back over black.
 
-    Arguments and results are those of `torch_backend.rasterize_to_pixels`, float32 and on the CPU. The number of
-    threads is torch's; results do not depend on it, to the last bit.
+    Arguments and results are those of `torch_backend.rasterize_to_pixels`, float32 and on the CPU. Results
+    do not depend on `num_threads`, to the last bit.
     """
     return _Rasterize.apply(means2d, conics, opacities, colors, depths, visible, width, height, absgrad)
 

@@ -78,10 +78,10 @@ def _start_tile(work):
 
 
 @jit
-def composite(begin, end, worker, bins, colors, render, alphas, depths):
+def composite(begin, end, worker, bins, colors, render, alphas, used):
     """Renders the tiles begin..end into render [C, H, W, D] and alphas [C, H, W, 1].
 
-    colors are [G, D padded to a multiple of GROUP]. depths [tiles] receives how many pairs of each tile
+    colors are [G, D padded to a multiple of GROUP]. used [tiles] receives how many pairs of each tile
     were used before all its pixels were saturated.
     """
     tiles_x, tiles_y, tile_offsets, gaussians = bins.tiles_x, bins.tiles_y, bins.tile_offsets, bins.gaussians
@@ -135,7 +135,7 @@ def composite(begin, end, worker, bins, colors, render, alphas, depths):
                     most = max(most, work[_T + p])
                 if most < _ZERO:
                     break
-        depths[tile] = pair - tile_offsets[tile]
+        used[tile] = pair - tile_offsets[tile]
         camera = tile // (tiles_x * tiles_y)
         wide = min(TILE, width - column * TILE)
         for i in range(min(TILE, height - row * TILE)):
@@ -237,9 +237,10 @@ def composite_neighbours(begin, end, worker, bins, means, conics, colors, visibl
 
 
 @jit
-def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alphas, wants, drawn, moments, v_colors):
+def composite_backward(begin, end, worker, bins, used, colors, v_render, v_alphas, wants, drawn, moments, v_colors):
     """Gradients of the tiles begin..end's pairs.
 
+    used [tiles]: of `composite`.
     wants: whether to fill moments, its columns for absgrad, and v_colors [E, padded D].
     drawn [E] receives which pairs come before all pixels are saturated; the others' gradients are not filled in.
     moments [E, 6 or 8], with v the gradient of a pixel's ln(alpha) and u = dx + s dy, are the sums over the tile of v
@@ -256,7 +257,7 @@ def composite_backward(begin, end, worker, bins, depths, colors, v_render, v_alp
     for tile in range(begin, end):
         row, column = (tile // tiles_x) % tiles_y, tile % tiles_x
         left, top = column * TILE + 0.5, row * TILE + 0.5
-        start, count = tile_offsets[tile], depths[tile]
+        start, count = tile_offsets[tile], used[tile]
         drawn[start : start + count] = True
         drawn[start + count : tile_offsets[tile + 1]] = False
         if count == 0:

@@ -34,19 +34,19 @@ def jit(function: Callable) -> Callable:
         return njit(**options)(function)
 
 
-def run(kernel: Callable, bounds: np.ndarray, *args) -> list:
+def run(kernel: Callable, bounds: np.ndarray, *args) -> None:
     """Calls `kernel(begin, end, worker, *args)` once per interval of `bounds` [workers + 1], at the same time.
 
-    The calling thread takes the first interval. Returns the results in the order of the intervals.
+    The calling thread takes the first interval.
     """
     global _pool
     workers = len(bounds) - 1
-    if workers == 1:
-        return [kernel(bounds[0], bounds[1], 0, *args)]
-    if _pool is None:
+    if workers > 1 and _pool is None:
         _pool = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="splatart-raster")
     futures = [_pool.submit(kernel, bounds[i], bounds[i + 1], i, *args) for i in range(1, workers)]
-    return [kernel(bounds[0], bounds[1], 0, *args)] + [future.result() for future in futures]
+    kernel(bounds[0], bounds[1], 0, *args)
+    for future in futures:
+        future.result()
 
 
 def even_bounds(count: int, workers: int) -> np.ndarray:
