@@ -31,7 +31,7 @@ from splatart_ns.capture.capture import Camera
 from splatart_ns.capture.images import write_png
 from splatart_ns.capture.joint_draws import draw_configurations
 from splatart_ns.capture.light import Light
-from splatart_ns.capture.procedural import write_object
+from splatart_ns.capture.procedural import build_object
 from splatart_ns.capture.ray_caster import RayCaster
 from splatart_ns.capture.robot import read_urdf
 from splatart_ns.capture.scene import Scene, camera_poses, ground_truth, part_surfaces
@@ -106,7 +106,7 @@ def write_room(name: str, folder: Path, options: Options) -> None:
     """`phone_0`, `phone_1`: what a phone and ns-process-data leave. `truth`: a capture with all labels, silhouettes and
     ground_truth.json."""
     with tempfile.TemporaryDirectory() as temporary:
-        robot = read_urdf(write_object(name, Path(temporary)) if name in OBJECTS else Path(name))
+        robot = read_urdf(build_object(name).write(Path(temporary)) if name in OBJECTS else Path(name))
         surfaces = part_surfaces(robot, {})
     if name in OBJECTS:
         configurations = [robot.complete(values) for values in OBJECTS[name]]

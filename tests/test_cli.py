@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from splatart_ns.capture.formats import load_capture
-from splatart_ns.capture.procedural import write_object
+from splatart_ns.capture.procedural import build_object
 from splatart_ns.capture.synthesis_options import SynthesisOptions
 from splatart_ns.rasterize.rasterization import default_backend, set_backend
 
@@ -261,7 +261,7 @@ def test_render_shows_other_channels(render, tmp_path, channel):
 
 
 def test_synth_renders_a_robot_and_its_own_objects(start_splatart, run_main, tmp_path):
-    urdf = write_object("drawer", tmp_path / "robot")
+    urdf = build_object("drawer").write(tmp_path / "robot")
     options = ("--train-views", 3, "--test-views", 1, "--resolution", 16)
     process = start_splatart("synth", urdf, "--output-dir", tmp_path / "a", *options)
     _, errors = process.communicate()

@@ -132,21 +132,6 @@ def is_object_name(text: str) -> bool:
     return text in OBJECTS or re.fullmatch(r"random(-[^./\\]*)?", text) is not None
 
 
-def write_object(name: str, folder: Path) -> Path:
-    """Write an object's URDF, meshes and textures into a folder; the same bytes each time.
-
-    Args:
-        name: one of `OBJECTS`, or random-SEED or random-SEED-PARTS.
-
-    Returns:
-        The path of the URDF.
-
-    Raises:
-        InputError: there is no such object.
-    """
-    return _build(name).write(Path(folder))
-
-
 def synthesize_object(name: str, output_dir: Path, options: SynthesisOptions | None = None) -> Path:
     """`synthesize` an object made by code, in states of its own unless joint values are given.
 
@@ -156,7 +141,7 @@ def synthesize_object(name: str, output_dir: Path, options: SynthesisOptions | N
         InputError: as `synthesize`; or there is no such object.
     """
     options = options or SynthesisOptions()
-    made = _build(name)
+    made = build_object(name)
     if not options.joint_values and not options.freeze:
         own = _STATES[name] if name in OBJECTS else random_joint_values(made, options.states, _seed(name)[0])
         if len(own) == options.states:
@@ -165,7 +150,12 @@ def synthesize_object(name: str, output_dir: Path, options: SynthesisOptions | N
         return synthesize(made.write(Path(folder)), output_dir, options)
 
 
-def _build(name: str) -> ArticulatedObject:
+def build_object(name: str) -> ArticulatedObject:
+    """One of `OBJECTS`, or random-SEED or random-SEED-PARTS.
+
+    Raises:
+        InputError: there is no such object.
+    """
     if name in _BUILDERS:
         return _BUILDERS[name]()
     if not is_object_name(name):

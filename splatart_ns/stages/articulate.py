@@ -83,13 +83,12 @@ def forward_kinematics(
     q: Tensor | Mapping[str, float | Sequence[float]],
     *,
     root_motion: Tensor | None = None,
-    clamp: bool = False,
 ) -> Tensor:
     """Motions [..., P, 4, 4] of all parts, in the order of `tree.part_ids`, from where they are at state 0.
 
     `q` [..., J]: the values of `tree.movable` one joint after the other, as many as it has degrees of freedom, or some
-    of them by joint name, the others 0. `root_motion` [..., 4, 4]: of the root, by default the identity. `clamp` keeps
-    the values within the observed limits. Differentiable in `q` and `root_motion`.
+    of them by joint name, the others 0. `root_motion` [..., 4, 4]: of the root, by default the identity.
+    Differentiable in `q` and `root_motion`.
     """
     movable = tree.movable
     dofs = [j.fit.dofs for j in movable]
@@ -100,9 +99,6 @@ def forward_kinematics(
         q = torch.cat(values) if values else torch.zeros(0).double()
     if q.shape[-1] != sum(dofs):
         raise ValueError(f"a configuration of {q.shape[-1]} values for {sum(dofs)} of the movable joints")
-    if clamp:
-        observed = tree.observed().to(q)
-        q = q.clamp(observed.amin(0), observed.amax(0))
     root = torch.eye(4).to(q) if root_motion is None else root_motion.to(q)
     root = root.expand(*np.broadcast_shapes(root.shape[:-2], q.shape[:-1]), 4, 4)  # see from_rotation_translation
     motions = {tree.root: root}

@@ -60,16 +60,6 @@ class PartPoints:
         return float(np.sqrt(self.weight @ ((self.xyz - self.centroid) ** 2).sum(1) / self.weight.sum()))
 
 
-@dataclass(frozen=True)
-class Registration:
-    """Distinct motions T [C, 4, 4] that bring the source onto the target, best fit first."""
-
-    T: np.ndarray
-    fit: np.ndarray
-    """Trimmed mean distance, both ways, of points and colours [C], length. Flat parts fit alike when turned over, so
-    this ranks candidates but must not choose among them (see render_choice)."""
-
-
 def part_points(splat: Splat, seen: Tensor, part: int) -> PartPoints:
     """The visible Gaussians whose most likely part is `part`; `seen` [N] is the splat's `visibility`."""
     chosen = splat.part_ids == part
@@ -80,8 +70,11 @@ def part_points(splat: Splat, seen: Tensor, part: int) -> PartPoints:
     return PartPoints(part_splat.means.double().numpy(), rgb, weight.double().numpy())
 
 
-def register(source: PartPoints, target: PartPoints, seed: int = 0) -> Registration:
-    """Candidates for the motion of a part, which differ by 6 degrees or 6 % of the radius or more.
+def register(source: PartPoints, target: PartPoints, seed: int = 0) -> np.ndarray:
+    """Candidates for the motion of a part [C, 4, 4], which differ by 6 degrees or 6 % of the radius or more.
+
+    Best fit first: the trimmed mean distance, both ways, of points and colours. Flat parts fit alike when turned over,
+    so this ranks candidates but must not choose among them (see render_choice).
 
     Starts: no motion, centroid on centroid with no turn, with the four proper alignments of the principal axes, and
     with random turns. All starts are followed together, once for each of `TRIMS`, and the `FOLLOWED` best to the end;
@@ -114,8 +107,7 @@ def register(source: PartPoints, target: PartPoints, seed: int = 0) -> Registrat
         motions.append(T[chosen])
         fits.append(fit[chosen])
     T, fit = np.concatenate(motions), np.concatenate(fits)
-    chosen = distinct(T, fit, source.centroid, source.radius)
-    return Registration(T[chosen], fit[chosen])
+    return T[distinct(T, fit, source.centroid, source.radius)]
 
 
 def point_to_plane(source: PartPoints, target: PartPoints, T: np.ndarray) -> np.ndarray:

@@ -125,7 +125,7 @@ def initial_motion(
         own_cost, identity_cost = fine.own_cost(), float(fine.cost(identity[None])[0])
         if identity_cost < STILL_RATIO * own_cost:  # no motion fits much better than a state's own Gaussians
             return InitialMotion(identity, found=True, still=True, cost=identity_cost, identity_ratio=1.0)
-    found = register(source, target, seed).T
+    found = register(source, target, seed)
     candidates = torch.from_numpy(found).to(identity)
     if coarse is None or fine is None:
         return InitialMotion(candidates[0], found=True)

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from splatart_ns.capture.procedural import synthesize_object, write_object
+from splatart_ns.capture.procedural import build_object, synthesize_object
 from splatart_ns.capture.robot import read_urdf
 from splatart_ns.capture.shapes import blocks, drum, rounded_box
 from splatart_ns.capture.synthesis_options import OBJECTS, SynthesisOptions
@@ -34,7 +34,7 @@ def test_solids_have_the_size_and_place_asked_for():
 
 @pytest.mark.parametrize("name", OBJECTS)
 def test_an_object_is_a_urdf_with_textured_parts(name, tmp_path):
-    robot = read_urdf(write_object(name, tmp_path))
+    robot = read_urdf(build_object(name).write(tmp_path))
     parts = robot.parts()
     assert len(parts) == len(robot.movable) + 1
     for part in parts:
@@ -46,8 +46,8 @@ def test_an_object_is_a_urdf_with_textured_parts(name, tmp_path):
 
 
 def test_an_object_is_written_the_same_each_time(tmp_path):
-    write_object("arm", tmp_path / "a")
-    write_object("arm", tmp_path / "b")
+    build_object("arm").write(tmp_path / "a")
+    build_object("arm").write(tmp_path / "b")
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
 
@@ -69,6 +69,6 @@ def test_joint_values_given_replace_the_objects_own(tmp_path):
     assert truth["joints"][0]["values"] == [0.0, 0.1]
 
 
-def test_an_unknown_object_is_answered_with_those_there_are(tmp_path):
+def test_an_unknown_object_is_answered_with_those_there_are():
     with pytest.raises(InputError, match="hinge, drawer, arm"):
-        write_object("spoon", tmp_path)
+        build_object("spoon")

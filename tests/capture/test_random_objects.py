@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from splatart_ns.capture.articulated_object import ArticulatedObject, Joint, Link
 from splatart_ns.capture.families import FAMILIES
 from splatart_ns.capture.interpenetration import Interpenetration
-from splatart_ns.capture.procedural import is_object_name, synthesize_object, write_object
+from splatart_ns.capture.procedural import build_object, is_object_name, synthesize_object
 from splatart_ns.capture.random_objects import MOST_PARTS, random_joint_values, random_object
 from splatart_ns.capture.robot import read_urdf
 from splatart_ns.capture.shapes import drum, rounded_box
@@ -36,7 +36,7 @@ def test_an_object_has_the_number_of_parts_asked_for():
 
 def test_one_seed_writes_the_same_bytes_and_another_one_others(tmp_path):
     for folder, name in (("a", "random-3-4"), ("b", "random-3-4"), ("c", "random-4-4")):
-        write_object(name, tmp_path / folder)
+        build_object(name).write(tmp_path / folder)
     files = sorted(path.name for path in (tmp_path / "a").iterdir())
     assert files == sorted(path.name for path in (tmp_path / "b").iterdir())
     assert all((tmp_path / "a" / f).read_bytes() == (tmp_path / "b" / f).read_bytes() for f in files)
@@ -106,10 +106,10 @@ def test_a_random_object_is_rendered_in_states_of_its_own(states, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["random", "random-", "random-x", "random-3-1", "random-3-11", "random-3-4-5"])
-def test_a_malformed_name_is_refused_with_an_example(name, tmp_path):
+def test_a_malformed_name_is_refused_with_an_example(name):
     assert is_object_name(name)
     with pytest.raises(InputError, match="write for example random-17"):
-        write_object(name, tmp_path)
+        build_object(name)
 
 
 @pytest.mark.parametrize("name", ["robot.urdf", "random-3.urdf", "random/robot", "randomly"])
