@@ -78,14 +78,8 @@ def observed_values(bundle: Bundle, state: int) -> dict[str, Tensor]:
 
 
 def moved_splat(bundle: Bundle, motions: Mapping[str, Tensor]) -> Splat:
-    """All parts' Gaussians, each moved by T[part]; in order of part id, SH padded to the highest degree."""
-    width = max(part.splat.sh.shape[1] for part in bundle.parts)
-    moved = []
-    for part in bundle.parts:
-        splat = part.splat.transformed(motions[part.name])
-        splat.sh = torch.nn.functional.pad(splat.sh, (0, 0, 0, width - splat.sh.shape[1]))
-        moved.append(splat)
-    return Splat.cat(moved)
+    """All parts' Gaussians, each moved by T[part]; in order of part id."""
+    return Splat.cat([part.splat.transformed(motions[part.name]) for part in bundle.parts])
 
 
 def posed_splat(bundle: Bundle, q: Mapping[str, JointValue]) -> Splat:
