@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatart_ns.capture.capture import Capture, Frame, Normalization, Problem, State
+from splatart_ns.capture.capture import UNLABELLED, Capture, Frame, Normalization, Problem, State
 from splatart_ns.capture.images import write_png
 from splatart_ns.capture.view import load_view
 from splatart_ns.errors import InputError
@@ -110,7 +110,7 @@ def _picture(frame: Frame) -> np.ndarray:
         image = image * alpha + np.array(_GREY, np.float32) * (1 - alpha)
     if view.labels is not None:
         labels = view.labels.numpy()
-        for part in np.unique(labels[(labels > 0) & (labels < 255)]):
+        for part in np.unique(labels[(labels > 0) & (labels != UNLABELLED)]):
             image[labels == part] = 0.45 * image[labels == part] + 0.55 * np.array(_colour(int(part)))
     image = image.astype(np.uint8)
     if view.alpha is not None:

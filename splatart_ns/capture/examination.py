@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatart_ns.capture.capture import Capture, Frame, Normalization, Problem, State
+from splatart_ns.capture.capture import UNLABELLED, Capture, Frame, Normalization, Problem, State
 from splatart_ns.capture.check import check_structure
 from splatart_ns.capture.hull import carve, fitting_views, project, silhouette, visible
 from splatart_ns.capture.part_votes import Ballot, PartVotes, read_ballots, vote
@@ -261,7 +261,7 @@ def _check_outlines(capture: Capture, one: _Evidence) -> Iterator[Problem]:
         if view.labels is None or view.alpha is None:
             continue
         inside = view.alpha > 127
-        known = view.labels != 255
+        known = view.labels != UNLABELLED
         edge = float((inside[1:] != inside[:-1]).sum() + (inside[:, 1:] != inside[:, :-1]).sum())
         if edge and inside.any():
             differ = float((((view.labels > 0) != inside) & known).sum())

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splatart_ns.capture.images import MAX_LABEL
 from splatart_ns.capture.robot import Part, Robot
 from splatart_ns.capture.surface import Surface
 from splatart_ns.errors import InputError
@@ -83,8 +84,9 @@ def part_surfaces(robot: Robot, frozen: Mapping[str, float]) -> dict[str, Surfac
     shaped = [part for part in robot.parts(frozen) if part.has_geometry]
     if not shaped:
         raise InputError(f"{robot.path}: no link has a <visual> that shows anything; there is nothing to render.")
-    if len(shaped) > 254:
-        raise InputError(f"{robot.path}: has {len(shaped)} parts; labels have room for 254, freeze some joints.")
+    if len(shaped) > MAX_LABEL:
+        found = f"has {len(shaped)} parts; labels have room for {MAX_LABEL}"
+        raise InputError(f"{robot.path}: {found}, freeze some joints.")
     return {part.name: robot.surface(part, frozen) for part in shaped}
 
 

@@ -26,15 +26,14 @@ class Panel:
         gui.configure_theme(control_layout="collapsible", show_logo=False)
         joints = {joint.child: joint for joint in bundle.tree_joints}
         hints = {joint.name: describe_joint(joint) for joint in bundle.tree_joints}
-        self._limits = bundle_sliders(bundle)
+        self._freedoms = bundle_sliders(bundle)
         self.sliders: list[viser.GuiInputHandle[float]] = []
         with gui.add_folder("Joints"):
-            for slider in self._limits:
-                limits = sorted(set(slider.ends))
-                hint = f"{hints[slider.joint]}; {slider.note}"
-                marks = tuple((x, f"{x:.3g}") for x in limits)
-                ends = (slider.low, slider.high, slider.step)
-                label = _breakable(slider.label)
+            for freedom in self._freedoms:
+                hint = f"{hints[freedom.joint]}; {freedom.note}"
+                marks = tuple((x, f"{x:.3g}") for x in sorted(set(freedom.ends)))
+                ends = (freedom.low, freedom.high, freedom.step)
+                label = _breakable(freedom.label)
                 self.sliders.append(gui.add_slider(label, *ends, initial_value=0.0, marks=marks, hint=hint))
             self.reset = gui.add_button("Reset", hint="All joints as in state 0")
             self.sweep = gui.add_checkbox("Sweep", False, hint="One joint after the other over its range")
@@ -59,13 +58,13 @@ class Panel:
     @property
     def q(self) -> Configuration:
         """What the sliders say; setting it moves them."""
-        return configuration(self._limits, [slider.value for slider in self.sliders])
+        return configuration(self._freedoms, [slider.value for slider in self.sliders])
 
     @q.setter
     def q(self, q: Configuration) -> None:
-        for slider, limits, position in zip(self.sliders, self._limits, positions(self._limits, q), strict=True):
-            position = round(min(max(position, limits.low), limits.high), 9)  # 30, and not 29.999999999999996
-            if abs(position - slider.value) > 1e-3 * limits.step:
+        for slider, freedom, position in zip(self.sliders, self._freedoms, positions(self._freedoms, q), strict=True):
+            position = round(min(max(position, freedom.low), freedom.high), 9)  # 30, and not 29.999999999999996
+            if abs(position - slider.value) > 1e-3 * freedom.step:
                 slider.value = position
 
     @property
