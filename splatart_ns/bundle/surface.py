@@ -19,6 +19,7 @@ from torch import Tensor
 
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.camera import project_points
+from splatart_ns.geometry.directions import golden_spiral
 from splatart_ns.geometry.se3 import matrix_from_quat, transform_points
 from splatart_ns.rasterize import rasterization
 from splatart_ns.rasterize.render import PIXEL_VARIANCE
@@ -210,12 +211,8 @@ def _look_around(splat: Splat, centre: Tensor, radius: float, pixels: int) -> li
 
 
 def _directions(count: int) -> Tensor:
-    """Unit vectors [count, 3] spread evenly over the sphere (Fibonacci lattice)."""
-    k = torch.arange(count, dtype=torch.float64)
-    z = 1 - (2 * k + 1) / count
-    azimuth = k * math.pi * (3 - math.sqrt(5))
-    r = (1 - z * z).sqrt()
-    return torch.stack([r * azimuth.cos(), r * azimuth.sin(), z], -1)
+    """Unit vectors [count, 3], float64, spread evenly over the sphere."""
+    return golden_spiral(1 - (2 * torch.arange(count, dtype=torch.float64) + 1) / count)
 
 
 def _look(splat: Splat, direction: Tensor, pixels: int) -> _DepthView:

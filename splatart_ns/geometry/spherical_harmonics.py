@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from splatart_ns.geometry.directions import golden_spiral
+
 SH_C0 = 0.5 / math.sqrt(math.pi)
 """The constant band; a colour is 0.5 + SH_C0 x its coefficient."""
 _C1 = math.sqrt(3 / (4 * math.pi))
@@ -53,17 +55,9 @@ def _band(dirs: Tensor, order: int) -> Tensor:
     return torch.stack(values)
 
 
-def _spread_directions(count: int) -> Tensor:
-    """Unit vectors [count, 3], float64, over half a sphere: opposite ones would add no information about a band."""
-    k = torch.arange(count, dtype=torch.float64)
-    z = (k + 0.5) / count
-    turn = k * math.pi * (3 - math.sqrt(5))
-    radius = (1 - z * z).sqrt()
-    return torch.stack([radius * turn.cos(), radius * turn.sin(), z], -1)
-
-
-# Band 3 has 7 functions; a few more directions make the system well conditioned.
-_DIRECTIONS = _spread_directions(10)
+# Band 3 has 7 functions; a few more directions make the system well conditioned. They are on half a sphere: opposite
+# ones would add no information about a band.
+_DIRECTIONS = golden_spiral((torch.arange(10, dtype=torch.float64) + 0.5) / 10)
 _FROM_VALUES = [torch.linalg.pinv(_band(_DIRECTIONS, order).T) for order in range(4)]
 
 
