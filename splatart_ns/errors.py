@@ -17,6 +17,11 @@ class InputError(Exception):
         super().__init__(printable(message))
 
 
+def first_line(error: Exception) -> str:
+    """The first line of what an error says, without its full stop; its type where it says nothing."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
+
+
 def printable(text: str) -> str:
     """A text on one line that leaves a terminal as it is, whatever names from outside are in it."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 from splatart_ns.batch.pool import THREADS, Death
 from splatart_ns.batch.stage import Needs
-from splatart_ns.errors import InputError
+from splatart_ns.errors import InputError, first_line
 
 _RETRIES = 5
 """Times that a task is started again when its node or process dies."""
@@ -34,8 +34,8 @@ class RayCluster:
             _knock(address)
             ray.init(address=address, log_to_driver=False, logging_level="ERROR", runtime_env={"env_vars": THREADS})
         except (OSError, ValueError, RuntimeError) as error:
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-            raise InputError(f"--address {address}: no Ray cluster can be used there ({reason}).") from None
+            found = f"no Ray cluster can be used there ({first_line(error)})"
+            raise InputError(f"--address {address}: {found}.") from None
         self._task = ray.remote(_call)
         self._tickets: dict[Any, Any] = {}
         self._look()

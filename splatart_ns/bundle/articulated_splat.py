@@ -24,7 +24,7 @@ from splatart_ns.bundle.posing import (
     part_features,
 )
 from splatart_ns.capture.capture import Normalization
-from splatart_ns.errors import InputError
+from splatart_ns.errors import InputError, first_line
 from splatart_ns.geometry.camera import viewmat_from_opengl
 from splatart_ns.rasterize.rasterization import default_device
 from splatart_ns.rasterize.render import Rendering, render
@@ -69,10 +69,6 @@ class Picture:
         return predicted_parts(self.alpha[..., None], self.part_shares, self.ids)
 
 
-def _first_line(error: Exception) -> str:
-    return str(error).partition("\n")[0].removesuffix(".")
-
-
 def predicted_parts(accumulation: Tensor, features: Tensor, ids: Tensor) -> Tensor:
     """The likeliest part id [..., H, W] of rendered accumulation [..., H, W, 1] and part shares [..., H, W, P].
 
@@ -101,7 +97,7 @@ class ArticulatedSplat:
             self.device = torch.device(device or default_device())
             torch.empty(0, device=self.device)
         except (RuntimeError, AssertionError) as error:  # of a torch without CUDA the second
-            raise InputError(f"the device '{device}' cannot be used ({_first_line(error)}); give 'cpu'") from error
+            raise InputError(f"the device '{device}' cannot be used ({first_line(error)}); give 'cpu'") from error
         parts = [replace(part, splat=part.splat.to(self.device)) for part in bundle.parts]
         self._on_device = replace(bundle, parts=parts)
         self._one_hot = part_features(bundle).to(self.device)

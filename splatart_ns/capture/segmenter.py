@@ -13,7 +13,7 @@ from splatart_ns.capture.capture import Capture, CaptureError, Frame, State
 from splatart_ns.capture.images import MAX_LABEL, read_image, read_sized, write_png
 from splatart_ns.capture.mask_export import mask_path, write_mask_classes
 from splatart_ns.capture.values import parse_number, read_json, show
-from splatart_ns.errors import InputError
+from splatart_ns.errors import InputError, first_line
 from splatart_ns.files import new_folder
 
 DEFAULT_MODEL = "facebook/sam2.1-hiera-small"
@@ -132,7 +132,7 @@ class Sam:
             self._model = AutoModelForMaskGeneration.from_pretrained(model, use_safetensors=True, **options)
         except (OSError, ValueError, KeyError) as error:
             raise InputError(
-                f"There is no segmenter {model!r} on this machine ({_first_line(error)}); download one with "
+                f"There is no segmenter {model!r} on this machine ({first_line(error)[:150]}); download one with "
                 f"`hf download {DEFAULT_MODEL}`, or give --model the folder of one, with its safetensors."
             ) from None
         self._model.to(device).eval()
@@ -162,7 +162,3 @@ class Sam:
                 masks = self._processor.post_process_masks(output.pred_masks.cpu(), *sizes, binarize=False)
                 logits.append(masks[0][0, best].float().numpy())
         return np.stack(logits)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")[:150]
