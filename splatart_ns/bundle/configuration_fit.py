@@ -14,7 +14,7 @@ from splatart_ns.bundle.posing import configured_motions, joint_motion, normaliz
 from splatart_ns.capture.capture import Normalization
 from splatart_ns.capture.view import View
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.part_pair import PartView, best_views, huber_cost, part_view
+from splatart_ns.stages.part_pair import PartView, best_looks, huber_cost
 from splatart_ns.stages.refinement import linearized
 
 _COARSE, _FINE = (5, 1500), (12, 10000)
@@ -55,7 +55,7 @@ def fit_configuration(bundle: Bundle, views: Sequence[View], normalization: Norm
     """
     splats = {part.name: normalized(part.splat, normalization) for part in bundle.parts}
     coarse, fine = (
-        {part.name: _looks(views, part.id, *size) if len(part.splat) else [] for part in bundle.parts}
+        {part.name: best_looks(views, part.id, *size) if len(part.splat) else () for part in bundle.parts}
         for size in (_COARSE, _FINE)
     )
     joints = [joint for joint in bundle.tree_joints if JOINT_DOFS[joint.type] > 0]
@@ -96,7 +96,7 @@ def appearance_residuals(
     """`ConfigurationFit.residual` of all parts that views show, where the parts' motions T[part] are known."""
     residuals = {}
     for part in bundle.parts:
-        if len(part.splat) and (looks := _looks(views, part.id, *_FINE)):
+        if len(part.splat) and (looks := best_looks(views, part.id, *_FINE)):
             T = _to_normal(motions[part.name][None], normalization)
             residuals[part.name] = float(_cost(normalized(part.splat, normalization), looks, T)[0])
     return residuals
@@ -112,15 +112,6 @@ def sweep_values(joint: Joint) -> Tensor:
         middle = (low + high) / 2
         return middle + torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
     return torch.linspace(2 * low - high, 2 * high - low, _SLIDE_SAMPLES, dtype=torch.float64)
-
-
-def _looks(views: Sequence[View], part: int, count: int, pixels: int) -> list[PartView]:
-    chosen = best_views(views, part, count)
-    if not chosen:
-        return []
-    area = sum(float((view.labels == part).sum()) for view in chosen) / len(chosen)
-    factor = max(1, int((area / pixels) ** 0.5))
-    return [look for view in chosen if (look := part_view(view, part, factor)) is not None]
 
 
 def _cost(splat: Splat, looks: Sequence[PartView], T: Tensor) -> Tensor:

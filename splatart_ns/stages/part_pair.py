@@ -164,6 +164,21 @@ def best_views(views: Sequence[View], part: int, count: int) -> list[View]:
     return [views[i] for i in chosen]
 
 
+def best_looks(
+    views: Sequence[View],
+    part: int,
+    count: int,
+    pixels: int,
+    device: torch.device | None = None,
+    near: bool = False,
+) -> tuple[PartView, ...]:
+    """`part_view` of the `best_views`, up to `count`, in which the part covers about `pixels` pixels or fewer."""
+    chosen = best_views(views, part, count)
+    areas = [float((v.labels == part).sum()) for v in chosen]
+    factor = max(1, int((sum(areas) / max(1, len(areas)) / pixels) ** 0.5))
+    return tuple(p for v in chosen if (p := part_view(v, part, factor, device, near)) is not None)
+
+
 @dataclass(frozen=True)
 class PartPair:
     """One part's Gaussians in two states, and views of both states."""
@@ -248,16 +263,11 @@ def part_pair(
     if min(len(p) for p in parts) == 0:
         return None
     device = parts[0].means.device
-    pieces = []
-    for state_views in views:
-        chosen = best_views(state_views, part, num_views)
-        areas = [float((v.labels == part).sum()) for v in chosen]
-        factor = max(1, int((sum(areas) / max(1, len(areas)) / pixels) ** 0.5))
-        pieces.append(tuple(p for v in chosen if (p := part_view(v, part, factor, device, near)) is not None))
-    if not pieces[0] and not pieces[1]:
+    looks = tuple(best_looks(some, part, num_views, pixels, device, near) for some in views)
+    if not looks[0] and not looks[1]:
         return None
     means = parts[0].means.double()
     weight = (parts[0].opacities * parts[0].part_probabilities[:, part]).double()
     centroid = weight @ means / weight.sum()
     radius = float((weight @ (means - centroid).square().sum(1) / weight.sum()).sqrt())
-    return PartPair(parts, (pieces[0], pieces[1]), centroid, radius)
+    return PartPair(parts, looks, centroid, radius)

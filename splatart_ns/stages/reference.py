@@ -17,6 +17,7 @@ from splatart_ns.geometry.se3 import adjoint, inverse, skew, transform_points
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.pose import part_extents
 from splatart_ns.stages.pose_evidence import refine_poses, rotation_held_ratios
+from splatart_ns.stages.visibility import shown_of_parts
 
 SHARE = 0.1
 """A part of which state 0 shows less than this share of what another state shows is registered against that one."""
@@ -27,12 +28,7 @@ be counted from. Theirs are never better than its own."""
 
 def reference_states(splats: Sequence[Splat], seen: Sequence[Tensor], num_parts: int) -> list[int]:
     """A state for each part 1..P; `seen` [N] is each splat's `visibility`."""
-    amount = torch.stack(
-        [
-            torch.zeros(num_parts + 1).index_add(0, splat.part_ids.cpu(), visible.cpu().float())[1:]
-            for splat, visible in zip(splats, seen, strict=True)
-        ]
-    )
+    amount = shown_of_parts(splats, seen, num_parts)
     return torch.where(amount[0] < SHARE * amount.amax(0), amount.argmax(0), 0).tolist()
 
 

@@ -69,6 +69,15 @@ def unobstructed(splat: Splat, rendering: Rendering) -> Tensor:
     return torch.where(drawn, alone, 0.0)
 
 
+def shown_of_parts(splats: Sequence[Splat], seen: Sequence[Tensor], num_parts: int) -> Tensor:
+    """How much of each part 1..P each state shows [S, P]: the sums of its Gaussians' `visibility`, `seen` [N]."""
+    amounts = []
+    for splat, of_splat in zip(splats, seen, strict=True):
+        amount = torch.zeros(num_parts + 1).index_add(0, splat.part_ids.cpu(), of_splat.cpu().float())
+        amounts.append(amount[1:])
+    return torch.stack(amounts)
+
+
 def shown(seen: Tensor, share: float = 0.98) -> Tensor:
     """Which Gaussians [N] make up `share` of all visibility `seen` [N]; the others are as good as hidden."""
     order = seen.argsort(descending=True)

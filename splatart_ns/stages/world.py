@@ -29,6 +29,7 @@ from splatart_ns.stages.render_choice import (
     VIEWS,
     initial_motion,
 )
+from splatart_ns.stages.visibility import shown_of_parts
 
 ALIKE = 1.05
 """A quite other turn that fits less than this many times worse may be the right one. Three by which a box's body looked
@@ -124,13 +125,8 @@ def _refined(
 
 def anchors(splats: Sequence[Splat], seen: Sequence[Tensor], num_parts: int) -> list[int]:
     """The parts 1..P by how much of them the state that shows least of them shows, most first."""
-    amount = torch.stack(
-        [
-            torch.zeros(num_parts + 1).index_add(0, s.part_ids.cpu(), v.cpu().float())[1:]
-            for s, v in zip(splats, seen, strict=True)
-        ]
-    )
-    return [int(p) + 1 for p in amount.amin(0).argsort(descending=True, stable=True)]
+    least = shown_of_parts(splats, seen, num_parts).amin(0)
+    return [int(p) + 1 for p in least.argsort(descending=True, stable=True)]
 
 
 def fit_worlds(
