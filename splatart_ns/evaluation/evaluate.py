@@ -18,7 +18,7 @@ from splatart_ns.capture.view import load_views
 from splatart_ns.errors import InputError
 from splatart_ns.evaluation.geometry import chamfer_centres, chamfer_mesh
 from splatart_ns.evaluation.ground_truth import GroundTruth, load_ground_truth
-from splatart_ns.evaluation.held_out import held_out_scores
+from splatart_ns.evaluation.held_out import fitted_residuals, held_out_scores
 from splatart_ns.evaluation.images import image_scores, is_mapped, novel_motions
 from splatart_ns.evaluation.joints import joint_errors, mean_errors
 from splatart_ns.evaluation.parts import part_pose_errors
@@ -65,8 +65,9 @@ def evaluate(bundle_folder: Path, capture_path: Path, device: torch.device | str
         _score_model(metrics, notes, bundle, truth, len(capture.states), capture_path)
     novel = load_novel(capture_path)
     _score_images(metrics, notes, bundle, truth, capture, novel, device)
+    fitted = fitted_residuals(bundle, capture) if novel else {}
     for state in novel:
-        metrics["held_out"][state.name] = held_out_scores(bundle, capture, state, device)
+        metrics["held_out"][state.name] = held_out_scores(bundle, capture, state, fitted, device)
     report = bundle_folder / "report.json"
     if report.is_file():
         metrics["speed"] = read_record(report, "run `splatart fit` again").fields

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -16,10 +16,25 @@ from splatart_ns.evaluation.images import image_scores
 
 
 @torch.no_grad()
+def fitted_residuals(bundle: Bundle, capture: Capture) -> dict[str, float]:
+    """Each part's mean residual in the held-out views of the states that the model was fitted to."""
+    residuals: dict[str, list[float]] = {}
+    for index, state in enumerate(capture.states):
+        motions, views = observed_motions(bundle, index), _held_out_views(capture, state)
+        for name, residual in appearance_residuals(bundle, motions, views, capture.normalization).items():
+            residuals.setdefault(name, []).append(residual)
+    return {name: _mean(values) for name, values in residuals.items()}
+
+
+@torch.no_grad()
 def held_out_scores(
-    bundle: Bundle, capture: Capture, state: State, device: torch.device | str = "cpu"
+    bundle: Bundle,
+    capture: Capture,
+    state: State,
+    fitted: Mapping[str, float],
+    device: torch.device | str = "cpu",
 ) -> dict[str, Any]:
-    """Find the joint values that a state's images show, and score the object there.
+    """Find the joint values that a state's images show, and score the object there; `fitted`: `fitted_residuals`.
 
     Returns:
         `values` of the joints (radians, lengths); `converged`; the mean `residual` of the moving parts at those values,
@@ -29,19 +44,13 @@ def held_out_scores(
     """
     views = _held_out_views(capture, state)
     found = fit_configuration(bundle, views, capture.normalization)
-    fitted: dict[str, list[float]] = {}
-    for index, fitted_state in enumerate(capture.states):
-        motions = observed_motions(bundle, index)
-        observed = appearance_residuals(bundle, motions, _held_out_views(capture, fitted_state), capture.normalization)
-        for name, residual in observed.items():
-            fitted.setdefault(name, []).append(residual)
     both = [name for name in found.residual if name in fitted]
     scores, _ = image_scores(bundle, configured_motions(bundle, found.q), views, capture, device)
     return {
         "values": {name: value.tolist() for name, value in found.q.items()},
         "converged": found.converged,
         "residual": _mean([found.residual[name] for name in both]),
-        "fitted_residual": _mean([_mean(fitted[name]) for name in both]),
+        "fitted_residual": _mean([fitted[name] for name in both]),
         "residuals": found.residual,
         "psnr": scores["psnr"],
         "part_iou": scores["part_iou"],

@@ -52,7 +52,9 @@ def test_any_ground_truth(copied, data):
 def test_any_capture_is_scored_or_refused(copied, bundle, tmp_path, monkeypatch, data):
     scores = dict.fromkeys(("residual", "fitted_residual", "psnr", "part_iou"))
     module = import_module("splatart_ns.evaluation.evaluate")
-    monkeypatch.setattr(module, "held_out_scores", lambda *_: scores)  # slow, and reads no file of its own
+    # These are slow, and read no file of their own.
+    monkeypatch.setattr(module, "held_out_scores", lambda *_: scores)
+    monkeypatch.setattr(module, "fitted_residuals", lambda *_: {})
     folder = tmp_path / "bundle"
     save_bundle(bundle, folder)
     (folder / "report.json").write_text('{"seconds": 3.0, "stages": [{"name": "pose", "seconds": 3.0}]}')
