@@ -86,37 +86,51 @@ def refine_poses(
     for p in range(P):
         refined, slides = 0, {}
         for s in range(1, S):
-            pair, equations = comparison.pair(p + 1, s, T[s, p]), None
+            pair = comparison.pair(p + 1, s, T[s, p])
             if pair is None:
                 covariances[s, p] = torch.nan
                 continue
-            if frozen[s, p]:
-                stays = refine(pair, T[s, p], 0)
-                found = _slid_a_little(pair, stays) or stays
-                T[s, p], equations = found.T, found.equations
-            else:
-                found = refine(pair, T[s, p], MAX_ITERATIONS)
-                clearer = comparison.without_haze(pair, p + 1, s, found.T)
-                if clearer is not pair:
-                    pair, found = clearer, refine(clearer, found.T, MAX_ITERATIONS)
-                T[s, p], equations = found.T, found.equations
-            turned, untold = settle_turn((splats[0], splats[s]), (views[0], views[s]), p + 1, T[s, p])
-            if not torch.equal(turned, T[s, p]):
-                found = refine(pair, turned, MAX_ITERATIONS)
-                if not untold.any():
-                    found, untold = _held_by_brightness(pair, T[s, p], turned, found)
-                T[s, p], equations = found.T, found.equations
-            covariances[s, p] = motion_covariance(pair, T[s, p], equations) + untold
+            pair, found, untold = _found(comparison, pair, p + 1, s, T[s, p], bool(frozen[s, p]))
+            T[s, p], covariances[s, p] = found.T, motion_covariance(pair, found.T, found.equations) + untold
             if something_rests and not frozen[s, p]:
                 refined += 1
-                if not untold.any() and _may_have_slid(pair, T[s, p]):
-                    slide = shifted(pair, T[s, p])
-                    if slide.cost < PRISMATIC_BELOW * found.cost:
-                        slides[s] = slide.T, motion_covariance(pair, slide.T, slide.equations)
+                slide = None if untold.any() else _slide(pair, found)
+                if slide is not None:
+                    slides[s] = slide.T, motion_covariance(pair, slide.T, slide.equations)
         if len(slides) == refined:
             for s, (slid, covariance) in slides.items():
                 T[s, p], covariances[s, p] = slid, covariance
     return T, covariances
+
+
+def _found(
+    comparison: _Comparison, pair: PartPair, part: int, s: int, T: Tensor, stays: bool
+) -> tuple[PartPair, Refinement, Tensor]:
+    """Where a part is at state s, from near its pose T [4, 4], with the pair that says so, and how uncertain it is
+    besides, of what no image tells [6, 6]. If it `stays`, only a little slide and a turn of its own are looked for."""
+    if stays:
+        rests = refine(pair, T, 0)
+        found = _slid_a_little(pair, rests) or rests
+    else:
+        found = refine(pair, T, MAX_ITERATIONS)
+        clearer = comparison.without_haze(pair, part, s, found.T)
+        if clearer is not pair:
+            pair, found = clearer, refine(clearer, found.T, MAX_ITERATIONS)
+    turned, untold = comparison.settle_turn(part, s, found.T)
+    if not torch.equal(turned, found.T):
+        ends = refine(pair, turned, MAX_ITERATIONS)
+        if not untold.any():
+            ends, untold = _held_by_brightness(pair, found.T, turned, ends)
+        found = ends
+    return pair, found, untold
+
+
+def _slide(pair: PartPair, found: Refinement) -> Refinement | None:
+    """A mere shift from where a part was found, if its images fit that as well."""
+    if not _may_have_slid(pair, found.T):
+        return None
+    slide = shifted(pair, found.T)
+    return slide if slide.cost < PRISMATIC_BELOW * found.cost else None
 
 
 def _slid_a_little(pair: PartPair, stays: Refinement) -> Refinement | None:
@@ -194,6 +208,10 @@ class _Comparison:
     def without_haze(self, pair: PartPair, part: int, s: int, T: Tensor) -> PartPair:
         """A `pair` that has been refined to T [4, 4]; the same one where there is no haze, or the part lies flush."""
         return pair if self._lies_flush(part, s) else without_haze(pair, T, (self._free(0), self._free(s)))
+
+    def settle_turn(self, part: int, s: int, T: Tensor) -> tuple[Tensor, Tensor]:
+        """See `symmetry.settle_turn`."""
+        return settle_turn((self._splats[0], self._splats[s]), (self._views[0], self._views[s]), part, T)
 
 
 def _held_by_brightness(pair: PartPair, T: Tensor, told: Tensor, ends: Refinement) -> tuple[Refinement, Tensor]:

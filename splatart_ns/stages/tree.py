@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -114,11 +114,7 @@ def infer_tree(
     known = known_states(motions, covariances)
     lost = {p for p in points if not known[p][0]}
     if root is None:
-        free = set(points) - set(required)
-        # Of what is not seen in all states it is not known that it rests.
-        free = {p for p in free if known[p].all()} or free - lost or free
-        if any(stood_still(p, motions, covariances) for p in free):
-            free = {p for p in free if covariances is None or not may_have_turned(covariances[p]).any()}
+        free = _possible_roots(set(points) - set(required), motions, covariances, known)
         root = choose_root({p: points[p] for p in free}, motions, radius, noise)
     if covariances is not None and stood_still(root, motions):
         # If it turned unseen, so did all that hangs on it.
@@ -129,11 +125,7 @@ def infer_tree(
         joints = descend_pairs(points, motions, radius, epsilon)
     else:
         joints = fit_pairs(points, motions, radius, render_ratios=render_ratios, **certainty)
-    for c in sorted(constraints, key=lambda c: not c.forbidden):
-        pair = {p: points[p] for p in (c.parent, c.child)}
-        excluded = {d.type for d in constraints if d.forbidden and {d.parent, d.child} == set(pair)}
-        told = told_pair(c, joints, pair, motions, radius, excluded, **certainty)
-        joints = {edge: fit for edge, fit in joints.items() if set(edge) != set(pair)} | told
+    joints = _as_told(constraints, joints, points, motions, radius, **certainty)
     # A part of which nothing tells where it is at state 0 hangs on others, and nothing hangs on it.
     joints = {(a, b): fit for (a, b), fit in joints.items() if a not in lost}
     blind = {(a, b) for a, b in joints if leads_blindly(known[a], known[b]) and required.get(b) != a}
@@ -157,9 +149,54 @@ def infer_tree(
     tree = replace(tree, unattached=tree.unattached | reasons)
     if method == "descent":  # its fits have no scores
         return replace(tree, joints=[replace(j, other=None) for j in tree.joints])
-    errors, weights = {}, {}
     places, motions, known = place_unseen(tree, motions, known)
     points = {p: transform_points(places[p].to(x), x) for p, x in points.items()}
+    errors, weights = _pose_errors(points, motions, covariances, known, radius, floor)
+    tree = refine_tree(tree, points, motions, errors, weights)
+    return tree if covariances is None else turned_unseen(tree, points, motions, covariances, errors, constraints)
+
+
+def _possible_roots(
+    free: set[int],
+    motions: Mapping[int, Tensor],
+    covariances: Mapping[int, Tensor] | None,
+    known: Mapping[int, Tensor],
+) -> set[int]:
+    """Those of some parts that may be the root: if possible such as are seen in all states, of others it is not known
+    that they rest, and such as surely did not turn, if any part stood still."""
+    free = {p for p in free if known[p].all()} or {p for p in free if known[p][0]} or free
+    if any(stood_still(p, motions, covariances) for p in free):
+        free = {p for p in free if covariances is None or not may_have_turned(covariances[p]).any()}
+    return free
+
+
+def _as_told(
+    constraints: Sequence[JointConstraint],
+    joints: dict[tuple[int, int], JointFit],
+    points: Mapping[int, Tensor],
+    motions: Mapping[int, Tensor],
+    radius: float,
+    **certainty: Any,
+) -> dict[tuple[int, int], JointFit]:
+    """The joints by (parent, child), with those between parts that the user knows of as `told_pair` says."""
+    for c in sorted(constraints, key=lambda c: not c.forbidden):
+        pair = {p: points[p] for p in (c.parent, c.child)}
+        excluded = {d.type for d in constraints if d.forbidden and {d.parent, d.child} == set(pair)}
+        told = told_pair(c, joints, pair, motions, radius, excluded, **certainty)
+        joints = {edge: fit for edge, fit in joints.items() if set(edge) != set(pair)} | told
+    return joints
+
+
+def _pose_errors(
+    points: Mapping[int, Tensor],
+    motions: Mapping[int, Tensor],
+    covariances: Mapping[int, Tensor] | None,
+    known: Mapping[int, Tensor],
+    radius: float,
+    noise: float,
+) -> tuple[dict[int, Tensor], dict[int, Tensor]]:
+    """Covariances [S, 6, 6] of the motions by part id: for regions, and for the weights of the refinement."""
+    errors, weights = {}, {}
     for p, x in points.items():
         told = torch.zeros(6, 6, dtype=torch.float64, device=x.device)
         if covariances is not None:
@@ -169,10 +206,9 @@ def infer_tree(
         # motions there are: measured, see docs/accuracy.md.
         share = 1 if covariances is None else max(1, len(motions[p]) - 1) ** 2
         errors[p], weights[p] = (
-            told + surface_error(x.double(), motions[p].double(), least, radius) for least in (floor, floor / share)
+            told + surface_error(x.double(), motions[p].double(), least, radius) for least in (noise, noise / share)
         )
-    tree = refine_tree(tree, points, motions, errors, weights)
-    return tree if covariances is None else turned_unseen(tree, points, motions, covariances, errors, constraints)
+    return errors, weights
 
 
 def choose_root(
