@@ -40,6 +40,12 @@ SETTINGS = {
 }
 
 
+def change_json(file, change):
+    content = json.loads(file.read_text())
+    change(content)
+    file.write_text(json.dumps(content))
+
+
 def results(folder):
     """The bytes of what a fit is for."""
     return {f.relative_to(folder): f.read_bytes() for f in [folder / "articulation.json", *folder.glob("parts/*")]}
@@ -248,6 +254,20 @@ class TestResuming:
     def test_none_with_other_settings(self, report, fit_copy, hinge_capture, other):
         assert not report(fit_copy, hinge_capture, **other).resume(STAGES[0], whole=True)
         assert finished_stages(fit_copy) == []
+
+    def test_none_of_another_version(self, report, fit_copy, hinge_capture, capsys):
+        change_json(fit_copy / "report.json", lambda told: told["versions"].update({"splatart-ns": "0.0.1"}))
+        assert not report(fit_copy, hinge_capture).resume(STAGES[0], whole=True)
+        assert "holds a fit by splatart-ns 0.0.1; starting over" in " ".join(capsys.readouterr().out.split())
+
+    def test_the_machine_that_trained_stays_in_the_report(self, report, fit_copy, hinge_capture):
+        change_json(fit_copy / "report.json", lambda told: told.update(device="cuda: a GPU", rasterizer="gsplat"))
+        again = report(fit_copy, hinge_capture)
+        assert all(again.resume(stage, whole=True) for stage in STAGES[:-1])
+        again.add("joint", {})
+        assert (again.data["device"], again.data["rasterizer"]) == ("cuda: a GPU", "gsplat")
+        again.add("pose", {})
+        assert again.data["device"] != "cuda: a GPU"
 
     def test_none_of_a_capture_that_was_changed(self, report, fit_copy, hinge_capture, tmp_path):
         changed = shutil.copytree(hinge_capture, tmp_path / "changed")

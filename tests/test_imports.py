@@ -20,7 +20,7 @@ BELOW = {
     "geometry": {"errors"},
     "splats": {"errors", "files", "geometry"},
     "rasterize": {"errors", "geometry", "splats", "threads"},
-    "capture": {"errors", "files", "geometry", "plain_yaml", "shape"},
+    "capture": {"errors", "files", "geometry", "machine", "plain_yaml", "shape"},
     "stages": {"capture", "errors", "geometry", "rasterize", "splats", "threads"},
 }
 BELOW["bundle"] = BELOW["stages"] | {"files", "records", "stages"}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -121,6 +122,7 @@ def load_bundle(folder: Path) -> Bundle:
     _check_unique(top, "parts", [part.id for part in parts])
     joints = [_read_joint(record, len(states), names) for record in top.records("joints")]
     _check_unique(top, "joints", [joint.name for joint in joints])
+    closing = [joint.name for joint in joints if not joint.in_tree]
 
     provenance = top.record("provenance")
     if "worlds" in provenance.fields:
@@ -139,7 +141,7 @@ def load_bundle(folder: Path) -> Bundle:
         root=top.choice("root", names),
         states=states,
         length_unit=top.record("units").text("length"),
-        loops=[_read_loop(record, joints, names) for record in top.records("loops")],
+        loops=[_read_loop(record, closing, names) for record in top.records("loops")],
         provenance=provenance.fields,
     )
     if (angle := top.record("units").text("angle")) != "radian":
@@ -245,8 +247,8 @@ def _read_covariance(record: Record, num_values: int) -> dict[str, Any]:
     return record.fields
 
 
-def _read_loop(record: Record, joints: list[Joint], parts: list[str]) -> dict[str, Any]:
-    joint = record.choice("joint", [joint.name for joint in joints if not joint.in_tree])
+def _read_loop(record: Record, closing: list[str], parts: list[str]) -> dict[str, Any]:
+    joint = record.choice("joint", closing)
     names = record.items("parts")
     if unknown := [name for name in names if name not in parts]:
         record.fail("parts", f"names {unknown[0]!r}", f"the parts are {', '.join(parts)}")
@@ -254,17 +256,17 @@ def _read_loop(record: Record, joints: list[Joint], parts: list[str]) -> dict[st
 
 
 def _check_unique(record: Record, key: str, values: list) -> None:
-    if repeated := {v for v in values if values.count(v) > 1}:
-        record.fail(key, f"has {repeated.pop()!r} twice", "names and ids must be unique")
+    if repeated := [v for v, count in Counter(values).items() if count > 1]:
+        record.fail(key, f"has {repeated[0]!r} twice", "names and ids must be unique")
 
 
 def _check_tree(bundle: Bundle, record: Record) -> None:
     """No part has two parents, the root has none, and every tree joint hangs from the root. A name means one joint."""
-    children = [joint.child for joint in bundle.joints if joint.in_tree]
+    children = Counter(joint.child for joint in bundle.joints if joint.in_tree)
     for name in bundle.part_names:
         most = 0 if name == bundle.root else 1
-        if children.count(name) > most:
-            found = f"give part '{name}' {children.count(name)} parents in the tree"
+        if children[name] > most:
+            found = f"give part '{name}' {children[name]} parents in the tree"
             record.fail("joints", found, "the root has none and every other part at most one")
     movers = {joint.child: joint for joint in bundle.joints if joint.in_tree}
     for joint in movers.values():

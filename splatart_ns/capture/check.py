@@ -17,14 +17,7 @@ from splatart_ns.capture.label_steps import count_steps
 from splatart_ns.capture.view import load_points
 from splatart_ns.capture.worlds import OTHER_WORLDS_MEND, looks_elsewhere
 from splatart_ns.errors import InputError
-
-
-def check_capture(path: Path | str) -> list[Problem]:
-    """All that is wrong with a capture: its structure first, then its files frame by frame, then its views and labels.
-
-    Every file is decoded once. Never raises for what is in the capture.
-    """
-    return check_structure(Path(path))[1]
+from splatart_ns.machine import num_cores
 
 
 def require_valid(path: Path | str, warn: Callable[[Problem], None] | None = None) -> Capture:
@@ -32,7 +25,7 @@ def require_valid(path: Path | str, warn: Callable[[Problem], None] | None = Non
 
     `warn` is called with each problem that is none.
     """
-    capture, problems = check_structure(Path(path))
+    capture, problems = check_capture(Path(path))
     errors = [p for p in problems if p.severity == "error"]
     if errors or capture is None:
         more = f" (and {len(errors) - 1} more, see `splatart check {path}`)" if len(errors) > 1 else ""
@@ -42,15 +35,19 @@ def require_valid(path: Path | str, warn: Callable[[Problem], None] | None = Non
     return capture
 
 
-def check_structure(path: Path) -> tuple[Capture | None, list[Problem]]:
-    """What can be read of a capture, None for nothing, and what `check_capture` says of it."""
+def check_capture(path: Path) -> tuple[Capture | None, list[Problem]]:
+    """What can be read of a capture, None for nothing, and all that is wrong with it: its structure first, then its
+    files frame by frame, then its views and labels.
+
+    Every file is decoded once. Never raises for what is in the capture.
+    """
     problems: list[Problem] = []
     try:
         capture = read_capture(path, problems.append)
     except CaptureError as error:
         return None, [*problems, error.problem]
     frames = [frame for state in capture.states for frame in state.frames]
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(num_cores()) as pool:
         contents = list(pool.map(lambda frame: _look(frame, capture.parts), frames))
     for content in contents:
         problems.extend(content.problems)

@@ -14,13 +14,14 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.capture import UNLABELLED, Capture, Frame, Normalization, Problem, State
-from splatart_ns.capture.check import check_structure
+from splatart_ns.capture.check import check_capture
 from splatart_ns.capture.hull import carve, fitting_views, project, silhouette, visible
 from splatart_ns.capture.part_votes import Ballot, PartVotes, read_ballots, vote
 from splatart_ns.capture.seen_surface import LEAST_CONFIRMED, measured_surface, object_pixels
 from splatart_ns.capture.view import View, load_view
 from splatart_ns.capture.worlds import OTHER_WORLDS_MEND
 from splatart_ns.errors import InputError
+from splatart_ns.machine import num_cores
 
 _PIXELS = 256
 """Frames are looked at with at most so many pixels along a side."""
@@ -144,7 +145,7 @@ def examine(path: Path | str, suggest: int = 0) -> Examination:
 
     Never raises for what is in the capture.
     """
-    capture, problems = check_structure(Path(path))
+    capture, problems = check_capture(Path(path))
     if capture is None:
         return Examination(None, tuple(problems))
     evidence = [_read_evidence(state) for state in capture.states]
@@ -179,10 +180,10 @@ def _read_evidence(state: State) -> _Evidence:
         try:
             longest = max(frame.camera.width, frame.camera.height)
             return load_view(frame, normalization, -(-longest // _PIXELS))
-        except InputError:  # `check_structure` has told
+        except InputError:  # `check_capture` has told
             return None
 
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(num_cores()) as pool:
         views = list(pool.map(read, frames))
     kept = [(frame, view) for frame, view in zip(frames, views, strict=True) if view is not None]
     return _Evidence(state, normalization, [frame for frame, _ in kept], [view for _, view in kept])

@@ -25,6 +25,7 @@ from splatart_ns.capture.images import MAX_LABEL, as_stored, orientation, write_
 from splatart_ns.capture.values import DISTORTION, is_inside, read_json, relative_path, show
 from splatart_ns.errors import InputError, printable
 from splatart_ns.files import new_folder, replacing_all, write_json
+from splatart_ns.machine import num_cores
 
 FRAME_FILES = ("file_path", "semantics_path", "mask_path", "object_mask_path", "depth_file_path")
 """Where a frame in a transforms.json names its files."""
@@ -121,7 +122,8 @@ def import_labels(path: Path, labels: Path) -> LabelImport:
             if image in files:
                 entry["semantics_path"] = files[image].relative_to(file.parent).as_posix()
         meta["semantic_classes"] = ["background", *parts]
-    with replacing_all([*(match.file for match in matches), *metas]) as temporary, ThreadPoolExecutor() as pool:
+    written = [*(match.file for match in matches), *metas]
+    with replacing_all(written) as temporary, ThreadPoolExecutor(num_cores()) as pool:
         for _ in pool.map(lambda match, file: write_png(file, draw(match)), matches, temporary[: len(matches)]):
             pass
         for file, meta in zip(temporary[len(matches) :], metas.values(), strict=True):

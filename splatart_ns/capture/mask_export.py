@@ -23,6 +23,7 @@ from splatart_ns.capture.class_list import (
 )
 from splatart_ns.capture.images import image_size, read_labels
 from splatart_ns.capture.values import read_text, show
+from splatart_ns.machine import num_cores
 
 MASK_CLASS_LISTS = (*CLASS_LISTS, "_classes.csv", "labelmap.txt")
 """Files of classes beside masks."""
@@ -84,7 +85,7 @@ def read_masks(path: Path, named: Names, pngs: Sequence[Path]) -> Split:
     for k, value in enumerate(named, start=1):
         place[value] = k
     background = {value for value, name in named.items() if name.lower() in BACKGROUND_NAMES}
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(num_cores()) as pool:
         found = list(pool.map(_mask_values, pngs))
     images = []
     for file in (file for file, values in zip(pngs, found, strict=True) if values is None or values - background):

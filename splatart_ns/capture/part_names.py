@@ -11,6 +11,7 @@ from typing import Any
 from splatart_ns.capture.capture import UNLABELLED, CaptureError, Frame, Problem, Report
 from splatart_ns.capture.images import MAX_LABEL, read_labels
 from splatart_ns.capture.values import show
+from splatart_ns.machine import num_cores
 
 
 def read_part_names(
@@ -75,7 +76,7 @@ def _largest_label(frames: Sequence[Frame], report: Report) -> int:
             return error.problem
         return int(labels[labels != UNLABELLED].max(initial=0))
 
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(num_cores()) as pool:
         found = list(pool.map(largest, [f.labels for f in frames if f.labels is not None]))
     for problem in found:
         if isinstance(problem, Problem):

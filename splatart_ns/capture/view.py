@@ -28,6 +28,7 @@ from splatart_ns.capture.images import (
     undistorted_camera,
 )
 from splatart_ns.errors import InputError
+from splatart_ns.machine import num_cores
 
 Window = tuple[int, int, int, int]
 """A piece of an image: left, top, right, bottom, in pixels; the last two are one past it."""
@@ -106,7 +107,7 @@ def load_views(capture: Capture, state: int | State, split: str = "train", downs
     Raises `InputError` for a file that cannot be used.
     """
     frames = (capture.states[state] if isinstance(state, int) else state).split(split)
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(num_cores()) as pool:
         return list(pool.map(lambda frame: load_view(frame, capture.normalization, downscale), frames))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.utils import writer
+from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
 from splatart_ns.errors import InputError
@@ -134,10 +135,13 @@ def _has_sizes(tensor: torch.Tensor, shape: Sequence[int | str], sizes: dict[str
 
 
 def finished_runs(capture: Path, method: str) -> list[Path]:
-    """The config.yml of every run of a method on a capture under outputs/ that took all its steps, oldest first."""
+    """The config.yml of every run of a method on a capture under outputs/ that took all its steps, oldest first.
+
+    One that cannot be read may be of another capture, and does not count.
+    """
     configs = Path("outputs").glob(f"*/{method}/*/config.yml")
     saved = [c for c in configs if _saved_steps(c) > 0]
-    on_capture = [c for c in saved if _data_of(c) == os.path.realpath(capture)]
+    on_capture = [c for c in saved if _is_of(c, os.path.realpath(capture))]
     finished = [c for c in on_capture if _saved_steps(c) >= _steps_of(c)]
     return sorted(finished, key=lambda config: config.stat().st_mtime)
 
@@ -154,6 +158,14 @@ def _steps_of(config: Path) -> int:
     if not isinstance(steps, int):
         raise InputError(f"{config} does not say how many steps its run was to take; train that stage again.")
     return steps
+
+
+def _is_of(config: Path, capture: str) -> bool:
+    try:
+        return _data_of(config) == capture
+    except InputError as error:
+        CONSOLE.log(f"Passed over: {error}", markup=False)
+        return False
 
 
 def _data_of(config: Path) -> str:

@@ -17,6 +17,7 @@ from splatart_ns.capture.capture import UNLABELLED, Capture
 from splatart_ns.capture.seen_surface import SeenSurface, measured_surface
 from splatart_ns.capture.view import View, Window, load_points, load_view
 from splatart_ns.errors import InputError
+from splatart_ns.machine import num_cores
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.stages.hull import EXACT, SeedPoints, seed_points, seen_surface, slack, visual_hull
 from splatart_ns.stages.silhouette import with_silhouette
@@ -55,7 +56,7 @@ class CaptureDataset(InputDataset):
     @cached_property
     def views(self) -> list[View]:
         """All frames' pixels, for who needs them again and again."""
-        with ThreadPoolExecutor() as pool:
+        with ThreadPoolExecutor(num_cores()) as pool:
             return list(pool.map(self.get_view, range(len(self))))
 
     def __getitem__(self, image_idx: int) -> dict[str, Any]:

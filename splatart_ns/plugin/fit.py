@@ -70,7 +70,9 @@ MOST_WARNINGS = 3
 """So many of the capture are said before a fit."""
 
 
-_REPORT = {"stages": [{"name": str, "seconds": NUMBER}], "settings": dict}
+_REPORT = {"stages": [{"name": str, "seconds": NUMBER}], "settings": dict, "versions": dict}
+_TRAINED_ON = ("device", "rasterizer")
+"""What the report says of the machine that trained; the one that finds the joints may be another."""
 
 
 @dataclass(frozen=True)
@@ -114,11 +116,12 @@ class Report:
     def __init__(self, path: Path, capture: Capture, settings: Settings):
         self.path = path
         self.data = report_head(capture, settings) | {"stages": [], "seconds": 0.0}
+        self._here = {key: self.data[key] for key in _TRAINED_ON}
         self._earlier = self._read_stages() if path.exists() else []
         self._last = time.perf_counter()
 
     def _read_stages(self) -> list[dict[str, Any]]:
-        """What an earlier run has finished, when it was of the same capture and settings."""
+        """What an earlier run has finished, when it was of the same capture, settings and version."""
         earlier = parse(self.path.read_bytes() if self.path.is_file() else None, _REPORT) or {"stages": None}
         # Versions before had seconds alone.
         stages = [{"wall_seconds": entry["seconds"], **entry} for entry in earlier["stages"] or ()]
@@ -134,10 +137,13 @@ class Report:
         }
         if any(had.get(k) != wanted[k] for k in last):
             stages = [stage for stage in stages if stage["name"] != "joint"]
-        if not same:
-            found = f"{self.path.parent} holds a fit of another capture or with other settings; starting over."
-            CONSOLE.print(found, markup=False)
-        return stages if same else []
+        version_had, version_here = (of["versions"].get("splatart-ns") for of in (earlier, self.data))
+        if same and version_had == version_here:
+            self.data |= {key: earlier[key] for key in _TRAINED_ON if key in earlier}
+            return stages
+        other = f"by splatart-ns {version_had}" if same else "of another capture or with other settings"
+        CONSOLE.print(f"{self.path.parent} holds a fit {other}; starting over.", markup=False)
+        return []
 
     def resume(self, stage: str, whole: bool) -> bool:
         """Whether a stage needs no work: it and all before it were finished, and its files are still `whole`."""
@@ -154,6 +160,7 @@ class Report:
     def add(self, stage: str, outcome: Outcome) -> None:
         """Note a finished stage."""
         now = time.perf_counter()
+        self.data |= self._here if stage != "joint" else {}
         self.data["stages"].append({"name": stage, "wall_seconds": round(now - self._last, 2), **outcome})
         self._last = now
         self._write()

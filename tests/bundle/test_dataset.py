@@ -125,7 +125,7 @@ def test_what_is_written_is_read_as_the_same_capture(dataset, tmp_path):
 def test_a_dataset_of_a_bundle_whose_part_ids_have_gaps_can_be_fitted(splat, tmp_path):
     folder = tmp_path / "capture"
     write_dataset(Dataset(splat, replace(OPTIONS, resolution=64)), folder, 18)
-    told = [(p.severity, p.message) for p in check_capture(folder) if "never labelled" in p.message]
+    told = [(p.severity, p.message) for p in check_capture(folder)[1] if "never labelled" in p.message]
     assert told == [("warning", f"part {i} (part_{i}) is never labelled") for i in range(3, 7)]
     assert require_valid(folder).parts[7] == "latch"
 

@@ -92,7 +92,7 @@ def test_folders_of_single_states_become_one_capture(capture_folder, tmp_path):
     assert import_capture(sources, tmp_path / "new") is None
     assert [s.name for s in load_capture(tmp_path / "new").states] == ["state_00", "state_01"]
     assert all_labels(tmp_path / "new") == truth
-    assert check_capture(tmp_path / "new") == []
+    assert check_capture(tmp_path / "new")[1] == []
 
 
 def test_a_copy_names_its_own_files_where_the_source_names_them_by_absolute_paths(capture_folder, tmp_path, edit):

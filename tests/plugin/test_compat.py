@@ -87,6 +87,13 @@ def test_a_run_that_was_killed_between_two_of_its_steps_is_not_finished(
     assert finished_runs(Path("door"), "splatart-semantic") == [finished]
 
 
+def test_a_run_that_cannot_be_read_stands_in_no_other_runs_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    good = write_run(Path("outputs/door/splatart-pose/a"), Path("door"))
+    write_run(Path("outputs/other/splatart-pose/b"), Path("other")).write_text("")
+    assert finished_runs(Path("door"), "splatart-pose") == [good]
+
+
 def test_an_uncaught_input_error_ends_a_process_with_one_sentence() -> None:
     code = "from splatart_ns.errors import InputError\nimport splatart_ns.plugin.compat\nraise {}('Mend it.')"
     ended = subprocess.run([sys.executable, "-c", code.format("InputError")], capture_output=True, text=True)
