@@ -237,6 +237,7 @@ class PosePipeline(StagePipeline):
                 if s != first:
                     pair = [(everything[first], everything[s]) for everything in (splats, self.views, self._seen)]
                     found.setdefault((first, s), {})[p + 1] = initial_motion(*pair, p + 1, self.config.seed)
+        moves = {part for motions in found.values() for part, m in motions.items() if m.found and not m.still}
         for (first, s), motions in found.items():
             ways = slide_ways(list(motions.values()))
             pair = [(everything[first], everything[s]) for everything in (splats, self.views)]
@@ -245,7 +246,9 @@ class PosePipeline(StagePipeline):
                 p = part - 1
                 M[s, p] = motion.T.cpu()
                 self._known[s, p] = motion.found
-                self._frozen[s, p] = not motion.found or (snap and motion.still)
+                # Of what moves at another state it is no surprise that it has moved a little.
+                still = motion.still and not (motion.maybe_moved and part in moves)
+                self._frozen[s, p] = not motion.found or (snap and still)
                 self._maybe_moved[s, p] = motion.maybe_moved
                 self.model.alike[p] |= len(motion.alike) > 0
                 self._note_alike(p, s, motion)

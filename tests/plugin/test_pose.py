@@ -366,6 +366,32 @@ def test_a_part_that_only_seems_to_rest_is_in_doubt_unless_more_is_found_of_it(p
     assert [note[:18] for note in pipeline.notes] == ["part lid, state 1:"] * (then == "stays")
 
 
+@pytest.mark.parametrize("moves_elsewhere", [False, True])
+def test_a_part_that_only_seems_to_rest_is_not_held_where_another_state_shows_that_it_moves(
+    pose_trainer, monkeypatch, moves_elsewhere
+):
+    pipeline = pose_trainer(init="centroids").pipeline
+    splats = [pipeline.model.state_splat(0), pipeline.model.state_splat(1), pipeline.model.state_splat(1)]
+    rests = InitialMotion(torch.eye(4).double(), found=True, still=True)
+    turned = InitialMotion(se3_exp(torch.tensor([0, 0, 0, 0, 0, 0.5]).double()), found=True)
+
+    def motion(pair, views, seen, part, seed):
+        if pair[1] is splats[2] and part == 2:
+            return replace(rests, maybe_moved=True)
+        return turned if moves_elsewhere and part == 2 else rests
+
+    monkeypatch.setattr("splatart_ns.plugin.pose.initial_motion", motion)
+    pipeline.config.init = "registration"
+    pipeline.views = [*pipeline.views, pipeline.views[1]]
+    pipeline._seen = [torch.ones(len(splat)) for splat in splats]
+    pipeline._known, pipeline._frozen, pipeline._maybe_moved = (
+        torch.full((3, 2), known) for known in (True, False, False)
+    )
+    pipeline._initial_poses(splats)
+    assert pipeline._frozen[2].tolist() == [True, not moves_elsewhere]
+    assert pipeline._frozen[1].tolist() == [True, not moves_elsewhere]
+
+
 def test_a_run_that_would_never_merge_is_refused(pose_trainer):
     with pytest.raises(InputError, match="max-num-iterations"):
         pose_trainer(steps=4, pose_steps=4, init="centroids")
