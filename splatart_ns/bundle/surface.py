@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import manifold3d
@@ -17,6 +18,7 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 from torch import Tensor
 
+from splatart_ns.bundle.occlusion import Extent
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.camera import project_points
 from splatart_ns.geometry.directions import golden_spiral
@@ -40,6 +42,10 @@ _AGREEING = 3
 _SAME_SIDE = math.cos(math.radians(20))
 """A view whose direction differs by less than this from a camera's shows what the camera saw: the views are 25 degrees
 apart."""
+_HIDDEN = 2.0
+"""What lies so much further than what stands before it is hidden by that, voxels."""
+_FRONT_PIXELS = 128
+"""Most pixels along a side of the images of what stands before a part."""
 _BAND = 3.0
 """Truncation of the signed distance, voxels."""
 _THICKEN = 0.75
@@ -60,6 +66,8 @@ class _DepthView:
     K: Tensor
     image: Tensor
     """Channels [5, H, W]: the accumulation, and times the accumulation: depth less _DISTANCE, colour."""
+    fronts: Tensor
+    """Depth less _DISTANCE of what stands around the part, at each state [S, h, w], infinite where nothing does."""
 
     def sample(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Accumulation [N], how far behind each of `points` [N, 3] the seen surface lies [N], its colour [N, 3]."""
@@ -68,6 +76,13 @@ class _DepthView:
         values = F.grid_sample(self.image[None], at, align_corners=False)[0, :, 0]
         accumulation, rest = values[0], values[1:] / values[0].clamp_min(1e-6)
         return accumulation, rest[0] - (z - _DISTANCE), rest[1:].T
+
+    def hidden(self, points: Tensor, voxel: float) -> Tensor:
+        """Which of `points` [N, 3] lie behind what stands before the part in all states [N] bool."""
+        uv, z = project_points(points, self.viewmat, self.K)
+        size = self.fronts.shape[-1]
+        column, row = (uv * (size / self.image.shape[-1])).long().clamp(0, size - 1).unbind(-1)
+        return (self.fronts[:, row, column] < z - _DISTANCE - _HIDDEN * voxel).all(0)
 
     def surface(self, least: float) -> Tensor:
         """Where the pixels of at least this accumulation see the part [N, 3]."""
@@ -80,17 +95,24 @@ class _DepthView:
 
 @torch.no_grad()
 def part_surface(
-    splat: Splat, cameras: Tensor | None = None, *, triangles: int = 20_000, voxels: int = 1_000_000
+    splat: Splat,
+    cameras: Tensor | None = None,
+    around: Sequence[Splat] = (),
+    *,
+    triangles: int = 20_000,
+    voxels: int = 1_000_000,
 ) -> trimesh.Trimesh:
     """A watertight mesh around the Gaussians of one part, in their frame and unit, with a colour per vertex.
 
     The part alone is rendered from all around. Space that several views see through is empty; all else is solid: what
-    no view can look into is closed, and a sheet that both sides are seen of has some thickness. A part too small or too
-    transparent to hide what is behind it becomes the convex hull of its Gaussians. Deterministic.
+    no view can look into is closed, and a sheet that both sides are seen of has some thickness. Where the part has no
+    Gaussians because others always stood before it, as on the face that one lies on, views do not see through. A part
+    too small or too transparent to hide what is behind it becomes the convex hull of its Gaussians. Deterministic.
 
     Args:
         splat: The Gaussians [N].
         cameras: Where the capture's cameras were [M, 3], M > 0, in the Gaussians' frame, if that is known.
+        around: What stands around the part at each state, in the Gaussians' frame: `surroundings`.
         triangles: Most triangles of the mesh, 100 or more; flat shapes take fewer.
         voxels: Number of voxels of the part's box. What is thinner than a voxel is not resolved.
 
@@ -127,11 +149,12 @@ def part_surface(
         shrunk = float(half.norm()) < 0.5 * radius
         radius = float(half.norm())
     half = half.numpy() / radius
+    extent = Extent.of((splat.means.double() - centre) / radius) if around else None
 
     while True:
         voxel = float((8 * half.prod() / voxels) ** (1 / 3))
-        views = _look_around(splat, centre, radius, math.ceil(2 / voxel))
-        level = _zero_level(views, half, voxel)
+        views = _look_around(splat, centre, radius, math.ceil(2 / voxel), around)
+        level = _zero_level(views, half, voxel, extent)
         if level is None:
             return _hull(splat, ends)
         solid = _simplified(_without_floaters(*level), triangles, voxel)
@@ -197,9 +220,18 @@ def _hull(splat: Splat, ends: Tensor) -> trimesh.Trimesh:
     return mesh
 
 
-def _look_around(splat: Splat, centre: Tensor, radius: float, pixels: int) -> list[_DepthView]:
+def _look_around(
+    splat: Splat, centre: Tensor, radius: float, pixels: int, around: Sequence[Splat] = ()
+) -> list[_DepthView]:
     """Views of the sphere about `centre` [3], made the unit sphere, `pixels` wide and high, from all around."""
-    unit = Splat(
+    unit, *others = (_unit(of, centre, radius) for of in (splat, *around))
+    return [_look(unit, others, direction, pixels) for direction in _directions(_VIEWS)]
+
+
+def _unit(splat: Splat, centre: Tensor, radius: float) -> Splat:
+    """A splat in the frame in which a sphere is the unit sphere."""
+    splat = splat.detach().to("cpu", torch.float32)
+    return Splat(
         means=((splat.means.double() - centre) / radius).float(),
         quats=splat.quats,
         # A Gaussian without any thickness has no slope.
@@ -207,7 +239,6 @@ def _look_around(splat: Splat, centre: Tensor, radius: float, pixels: int) -> li
         opacity_logits=splat.opacity_logits,
         sh=splat.sh,
     )
-    return [_look(unit, direction, pixels) for direction in _directions(_VIEWS)]
 
 
 def _directions(count: int) -> Tensor:
@@ -215,7 +246,7 @@ def _directions(count: int) -> Tensor:
     return golden_spiral(1 - (2 * torch.arange(count, dtype=torch.float64) + 1) / count)
 
 
-def _look(splat: Splat, direction: Tensor, pixels: int) -> _DepthView:
+def _look(splat: Splat, around: Sequence[Splat], direction: Tensor, pixels: int) -> _DepthView:
     forward = -direction
     side = torch.linalg.cross(forward, torch.eye(3, dtype=torch.float64)[int(forward.abs().argmin())])
     side = side / side.norm()
@@ -239,7 +270,21 @@ def _look(splat: Splat, direction: Tensor, pixels: int) -> _DepthView:
     from_centre = torch.arange(pixels)[:, None] + 0.5 - pixels / 2
     depth = _median_depth(weight, at_centre + along_x * from_centre + along_y * from_centre[:, None])
     channels = torch.cat([accumulation[0], accumulation[0] * depth[..., None], image[0, ..., :3]], -1)
-    return _DepthView(viewmat, K, channels.permute(2, 0, 1).contiguous())
+    size = min(pixels, _FRONT_PIXELS)
+    smaller = torch.diag(torch.tensor([size / pixels, size / pixels, 1.0])) @ K
+    fronts = [_front(other, viewmat, smaller, size) for other in around]
+    fronts = torch.stack(fronts) if fronts else torch.full((1, 1, 1), torch.inf)
+    return _DepthView(viewmat, K, channels.permute(2, 0, 1).contiguous(), fronts)
+
+
+def _front(splat: Splat, viewmat: Tensor, K: Tensor, pixels: int) -> Tensor:
+    """How far what is seen of a splat is, less _DISTANCE, in the mean [H, W]; infinite where little is."""
+    splat = splat.select(splat.opacities > _FAINT)
+    z = transform_points(viewmat, splat.means)[:, 2:]
+    gaussians = splat.means, splat.quats, splat.scales, splat.opacities, z
+    depth, accumulation, _ = rasterization(*gaussians, viewmat[None], K[None], pixels, pixels, eps2d=PIXEL_VARIANCE)
+    depth, accumulation = depth[0, ..., 0], accumulation[0, ..., 0]
+    return torch.where(accumulation > 0.5, depth / accumulation.clamp_min(1e-6) - _DISTANCE, torch.inf)
 
 
 def _base_colours(splat: Splat) -> Tensor:
@@ -281,7 +326,9 @@ def _median_depth(weight: Tensor, moment: Tensor) -> Tensor:
     return ((moment.gather(-1, far) - moment.gather(-1, near)) / inside.clamp_min(1e-6))[..., 0]
 
 
-def _zero_level(views: list[_DepthView], half: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray] | None:
+def _zero_level(
+    views: list[_DepthView], half: np.ndarray, voxel: float, extent: Extent | None
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Vertices and faces of the border between empty and solid in a box of half sides [3]; None where all is empty."""
     # Whole coarse cells, with an empty margin.
     cells = np.ceil(2 * half / (voxel * _COARSE)).astype(int) + 2
@@ -290,7 +337,7 @@ def _zero_level(views: list[_DepthView], half: np.ndarray, voxel: float) -> tupl
 
     def field_at(nodes: Tensor) -> np.ndarray:
         points = torch.stack([axis[i] for axis, i in zip(axes, nodes.unbind(-1), strict=True)], -1)
-        return _field(views, points, voxel).numpy()
+        return _field(views, points, voxel, extent).numpy()
 
     coarse_nodes = torch.cartesian_prod(*[torch.arange(0, len(axis), _COARSE) for axis in axes])
     coarse = field_at(coarse_nodes).reshape(cells + 1)
@@ -319,16 +366,20 @@ def _upsampled(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def _field(views: list[_DepthView], points: Tensor, voxel: float) -> Tensor:
+def _field(views: list[_DepthView], points: Tensor, voxel: float, extent: Extent | None) -> Tensor:
     """Truncated signed distance [N] at `points` [N, 3], positive where empty: what _AGREEING views at least find.
 
-    The mean over views, the common choice, makes two-sided sheets as thick as the truncation, or loses them.
+    The mean over views, the common choice, makes two-sided sheets as thick as the truncation, or loses them. Views find
+    nothing within the part's `extent` where others hid it from them in all states; None, where nothing could.
     """
+    within = None if extent is None else extent.holds(points)
     largest = torch.full((_AGREEING, len(points)), -1.0)
     for view in views:
         accumulation, behind, _ = view.sample(points)
         value = (behind / voxel - _THICKEN).div_(_BAND).clamp_(-1, 1)
         value = torch.maximum(value, 1 - 2 * accumulation)
+        if within is not None:
+            value[within & view.hidden(points, voxel)] = -1.0
         for k in range(_AGREEING):
             value, largest[k] = torch.minimum(largest[k], value), torch.maximum(largest[k], value)
     return largest[-1]

@@ -4,30 +4,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from solid_splat import splat_on
 
 from splatart_ns.bundle.surface import part_surface
 from splatart_ns.errors import InputError
-from splatart_ns.geometry.se3 import quat_from_matrix
 from splatart_ns.splats.splat import Splat
 
 VOXELS = 60_000
-
-
-def splat_on(mesh: trimesh.Trimesh, n: int = 3000, opacity: float = 0.7) -> Splat:
-    """Flat Gaussians on a mesh; colour is green where x > 0, else red."""
-    points, face = trimesh.sample.sample_surface(mesh, n, seed=0)
-    z = mesh.face_normals[face]
-    x = np.cross(z, np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]]))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    sigma = math.sqrt(mesh.area / n)
-    rgb = np.where(points[:, :1] > 0, [[0.0, 1, 0]], [[1.0, 0, 0]])
-    return Splat(
-        means=torch.from_numpy(points).float(),
-        quats=quat_from_matrix(torch.from_numpy(np.stack([x, np.cross(z, x), z], -1))).float(),
-        log_scales=torch.tensor([sigma, sigma, 0.1 * sigma]).log().repeat(n, 1),
-        opacity_logits=torch.full((n,), math.log(opacity / (1 - opacity))),
-        sh=torch.from_numpy((rgb - 0.5) * 2 * math.sqrt(math.pi)).float()[:, None],
-    )
 
 
 def few(means: list[list[float]], scales=(0.1, 0.1, 0.1), opacity_logit: float = 3.0) -> Splat:
@@ -204,3 +187,40 @@ def test_nothing_visible_is_an_error(splat):
 def test_no_extent_is_an_error():
     with pytest.raises(InputError, match="no extent"):
         part_surface(few([[0.0, 0, 0]], (0.0, 0.0, 0.0)))
+
+
+def open_box():
+    """Without its upper face, at 0.2."""
+    box = trimesh.creation.box((1, 0.6, 0.4))
+    box.update_faces(box.face_normals[:, 2] < 0.5)
+    return splat_on(box, 5000)
+
+
+def lying_on(box_at):
+    """A box as wide as the open one, its lower face at a height, without Gaussians there."""
+    box = trimesh.creation.box((1.02, 0.62, 0.2))
+    box.update_faces(box.face_normals[:, 2] > -0.5)
+    box.apply_translation([0, 0, box_at + 0.1])
+    return splat_on(box, 5000)
+
+
+def test_the_face_that_another_part_lies_on_in_all_states_is_closed():
+    alone = part_surface(open_box(), voxels=VOXELS)
+    under = part_surface(open_box(), around=[lying_on(0.2), lying_on(0.2)], voxels=VOXELS)
+    assert_solid(under)
+    assert alone.volume < 0.5 * 1 * 0.6 * 0.4
+    assert under.volume == pytest.approx(1 * 0.6 * 0.4, rel=0.15)
+    assert under.bounds[1, 2] == pytest.approx(0.2, abs=0.03)
+
+
+def test_a_hollow_stays_that_another_part_uncovers_in_some_state():
+    alone = part_surface(open_box(), voxels=VOXELS)
+    uncovered = part_surface(open_box(), around=[lying_on(0.2), lying_on(3.0)], voxels=VOXELS)
+    assert uncovered.volume == pytest.approx(alone.volume, rel=0.05)
+
+
+def test_what_another_part_hides_beside_a_part_is_none_of_it():
+    box = trimesh.creation.box((1, 0.6, 0.4))
+    alone = part_surface(splat_on(box), voxels=VOXELS)
+    beside = part_surface(splat_on(box), around=[lying_on(0.2)] * 2, voxels=VOXELS)
+    assert beside.volume == pytest.approx(alone.volume, rel=0.02)

@@ -6,14 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
-from torch import Tensor
 
-from splatart_ns.bundle.bundle import Bundle
+from splatart_ns.bundle.bundle import Bundle, Part
 from splatart_ns.bundle.collision import convex_pieces
+from splatart_ns.bundle.occlusion import surroundings
 from splatart_ns.bundle.surface import part_surface
 from splatart_ns.bundle.vantage import cameras_around
 from splatart_ns.errors import InputError
-from splatart_ns.splats.splat import Splat
 
 
 @dataclass(frozen=True)
@@ -36,12 +35,12 @@ class PartShape:
 
 def part_shapes(bundle: Bundle) -> dict[str, PartShape]:
     """The shape of each part, by name, in the canonical frame and the bundle's unit."""
-    return {part.name: _shape(part.splat, cameras_around(bundle, part)) for part in bundle.parts}
+    return {part.name: _shape(bundle, part) for part in bundle.parts}
 
 
-def _shape(splat: Splat, cameras: Tensor | None) -> PartShape:
+def _shape(bundle: Bundle, part: Part) -> PartShape:
     try:
-        surface = part_surface(splat, cameras)
+        surface = part_surface(part.splat, cameras_around(bundle, part), surroundings(bundle, part))
     except InputError:
         return PartShape(None, ())
     return PartShape(surface, tuple(convex_pieces(surface)))
