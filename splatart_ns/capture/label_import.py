@@ -22,6 +22,7 @@ from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame
 from splatart_ns.capture.class_list import BACKGROUND_NAMES, UNLABELLED_NAMES
 from splatart_ns.capture.formats import SPLITS, TRANSFORMS, load_capture, load_states
 from splatart_ns.capture.images import MAX_LABEL, as_stored, orientation, write_png
+from splatart_ns.capture.part_names import safe_names
 from splatart_ns.capture.values import DISTORTION, is_inside, read_json, relative_path, show
 from splatart_ns.errors import InputError, printable
 from splatart_ns.files import new_folder, replacing_all, write_json
@@ -303,16 +304,21 @@ def _without_prefix(path: PurePosixPath) -> PurePosixPath:
 
 
 def _part_ids(labels: Path, parts: list[str], classes: Sequence[str]) -> np.ndarray:
-    """The part id of every class, by its place from 1 on, uint8; new names are appended to `parts`."""
+    """The part id of every class, by its place from 1 on, uint8; new names are appended to `parts`.
+
+    A class may have a part's name as the capture's reader and our own labels have it, where that is made fit for files.
+    """
+    known = [part.lower() for part in parts]
+    own = {name.lower(): part for name, part in zip(safe_names(parts), parts, strict=True)}
     ids = [0]
-    for name in classes:
-        known = [part.lower() for part in parts]
+    for name in (name if name.lower() in known else own.get(name.lower(), name) for name in classes):
         if name.lower() in (*BACKGROUND_NAMES, *UNLABELLED_NAMES) and name.lower() not in known:
             ids.append(0 if name.lower() in BACKGROUND_NAMES else UNLABELLED)
             continue
         if name.lower() not in known:
             parts.append(name)
-        ids.append([part.lower() for part in parts].index(name.lower()) + 1)
+            known.append(name.lower())
+        ids.append(known.index(name.lower()) + 1)
     if len(parts) > MAX_LABEL:
         raise CaptureError(labels, f"there are {len(parts)} parts", f"label at most {MAX_LABEL}")
     return np.array(ids, np.uint8)

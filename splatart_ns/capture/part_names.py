@@ -18,7 +18,8 @@ def read_part_names(
     metas: Sequence[tuple[Path, dict[str, Any]]], frames: Sequence[Frame], report: Report
 ) -> dict[int, str]:
     """Part id to name, from the `semantic_classes` of transforms.json files (path and content), else `part_1`,
-    `part_2`, ... up to the largest id in the frames' labels. What cannot be read is reported and left out."""
+    `part_2`, ... up to the largest id in the frames' labels. What cannot be read is reported and left out, and so is
+    told what is called otherwise than `semantic_classes` says."""
     named: tuple[Path, list[str]] | None = None
     for file, meta in metas:
         try:
@@ -32,7 +33,13 @@ def read_part_names(
         elif classes is not None:
             named = named or (file, classes)
     if named is not None:
-        return {i + 1: name for i, name in enumerate(safe_names(named[1]))}
+        file, given = named
+        safe = safe_names(given)
+        if changed := [f"{show(old)} is called {new}" for old, new in zip(given, safe, strict=True) if old != new]:
+            called = ", ".join(changed[:3]) + (", ..." if len(changed) > 3 else "")
+            mend = "use that name, or write others of A-Z, a-z, 0-9, _, . and - into semantic_classes"
+            report(Problem("warning", file, f"part names are made fit for files: {called}", mend))
+        return dict(enumerate(safe, start=1))
     return {i: f"part_{i}" for i in range(1, _largest_label(frames, report) + 1)}
 
 
@@ -54,18 +61,22 @@ def _classes(file: Path, meta: dict[str, Any]) -> list[str] | None:
 
 
 def safe_names(names: Sequence[str]) -> list[str]:
-    """Names that can be file names everywhere: of [A-Za-z0-9_.-], and unique even where case does not count."""
-    out: list[str] = []
+    """Names that can be file names everywhere: of [A-Za-z0-9_.-], and unique even where case does not count. Those that
+    can be keep theirs, so that no name becomes what another one is."""
+    bases = [
+        re.sub(r"[^A-Za-z0-9_.-]+", "_", name)[:64].lstrip(".-").rstrip(".") or f"part_{i + 1}"
+        for i, name in enumerate(names)
+    ]
+    out: dict[int, str] = {}
     taken: set[str] = set()
-    for i, name in enumerate(names):
-        base = re.sub(r"[^A-Za-z0-9_.-]+", "_", name)[:64].lstrip(".-").rstrip(".") or f"part_{i + 1}"
-        safe, n = base, 1
+    for i in sorted(range(len(names)), key=lambda i: bases[i] != names[i]):
+        safe, n = bases[i], 1
         while safe.lower() in taken:
             n += 1
-            safe = f"{base}_{n}"
+            safe = f"{bases[i]}_{n}"
         taken.add(safe.lower())
-        out.append(safe)
-    return out
+        out[i] = safe
+    return [out[i] for i in range(len(names))]
 
 
 def _largest_label(frames: Sequence[Frame], report: Report) -> int:

@@ -248,6 +248,15 @@ def test_more_gaps_than_numbers_are_an_error(capture_folder, edit):
     assert problem.mend.startswith("number the parts 1, 2, ... without gaps")
 
 
+def test_names_that_are_made_fit_for_files_are_told_once(capture_folder, edit):
+    for k in range(2):
+        change = {"semantic_classes": ["background", "left door/T\u00fcr", "base"]}
+        edit(capture_folder / f"state_0{k}/transforms.json", lambda m, change=change: m.update(change))
+    (problem,) = check_capture(capture_folder)
+    assert problem.severity == "warning" and problem.file == capture_folder / "state_00/transforms.json"
+    assert problem.message.endswith("'left door/T\u00fcr' is called left_door_T_r")
+
+
 def test_no_labels_at_all_is_one_error(capture_folder):
     for k in range(2):
         for i in (1, 2):

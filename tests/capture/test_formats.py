@@ -224,6 +224,7 @@ def test_part_names_become_safe_and_unique_file_names():
     assert not any(n.startswith(".") for n in made)
     assert max(map(len, made)) <= 64
     assert safe_names(["link_0", "panda.finger-1"]) == ["link_0", "panda.finger-1"]
+    assert safe_names(["a b", "A_b", "a_b_2"]) == ["a_b_3", "A_b", "a_b_2"]
 
 
 @pytest.mark.parametrize(

@@ -179,6 +179,19 @@ def test_declared_parts_keep_their_ids_and_new_ones_follow(capture_folder, tmp_p
     assert set(np.unique(read_labels(capture.states[0].frames[0].labels))) == {0, 2, 3}
 
 
+@pytest.mark.parametrize("name", EXPORTS)
+def test_parts_whose_names_no_file_can_have_are_found_by_those_of_our_labels(capture_folder, tmp_path, edit, name):
+    names = ["background", "left door/T\u00fcr", "left_door_T_r"]
+    for state in capture_folder.iterdir():
+        edit(state / "transforms.json", lambda meta: meta.update(semantic_classes=names))
+    capture = load_capture(capture_folder)
+    assert capture.parts == {1: "left_door_T_r_2", 2: "left_door_T_r"}
+    truth = all_labels(capture_folder)
+    done = import_capture([capture_folder], tmp_path / "new", EXPORTS[name](capture, tmp_path / "export"))
+    assert done.parts == tuple(names[1:])
+    assert load_capture(tmp_path / "new").parts == capture.parts and all_labels(tmp_path / "new") == truth
+
+
 def test_new_classes_beside_old_labels_without_names_are_refused(capture_folder, tmp_path, edit):
     export = write_masks(load_capture(capture_folder), tmp_path / "export", flat_name)
     for state in ("state_00", "state_01"):
