@@ -28,7 +28,7 @@ from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import se3_exp, se3_log
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint
 from splatart_ns.plugin.gaussians import SPLAT_SHAPES, gauss_params_from_splat, splat_from_state
-from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
+from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig, refuse_unread
 from splatart_ns.plugin.pipeline import StagePipeline
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics, shifted
@@ -211,6 +211,7 @@ class JointPipeline(StagePipeline):
         super().__init__(config, device, test_mode, *args, **kwargs)
         if test_mode != "val":  # a checkpoint brings everything
             return
+        refuse_unread(self.model.config, "splatart-joint")
         capture = self.datamanager.capture
         normalization = capture.normalization
         run = config.pose_run or find_pose_run(capture.path)

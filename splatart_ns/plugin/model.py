@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 import torch
@@ -42,6 +42,21 @@ class SplatartModelConfig(SplatfactoModelConfig):
     """For the whole process; auto: what was chosen before, else gsplat on CUDA, numba where installed, torch."""
 
 
+_READ = {"background_color", "camera_optimizer", "rasterize_mode", "sh_degree_interval"}
+"""The options of Splatfacto that say how a splat is shown, or are refused by all models."""
+
+
+def refuse_unread(config: SplatartModelConfig, method: str) -> None:
+    """Raise `InputError` for an option of Splatfacto's that a later stage's method would pass over."""
+    usual = type(config)()
+    for name in (one.name for one in fields(SplatfactoModelConfig) if one.name not in _READ):
+        if (value := getattr(config, name)) != getattr(usual, name):
+            option = f"--pipeline.model.{name.replace('_', '-')}"
+            raise InputError(
+                f"{option} is {value}, but {method} does not read it; leave it out, or give it to splatart-semantic."
+            )
+
+
 class SplatartModel(SplatfactoModel):
     """Splatfacto with part logits; everything it renders comes out of one rasterization."""
 
@@ -58,6 +73,11 @@ class SplatartModel(SplatfactoModel):
             raise InputError(
                 "--pipeline.model.use-bilateral-grid is True, but there is none in SPLATART's models; leave it out: "
                 "splatart-semantic brings frames to one exposure without it."
+            )
+        if self.config.color_corrected_metrics:
+            raise InputError(
+                "--pipeline.model.color-corrected-metrics is True, but SPLATART's models measure images as they are; "
+                "leave it out: splatart-semantic brings frames to one exposure."
             )
         if self.config.rasterizer != "auto":
             set_backend(self.config.rasterizer)

@@ -26,7 +26,7 @@ from splatart_ns.capture.view import View
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import inverse, so3_log
 from splatart_ns.plugin.gaussians import gauss_params_from_splat
-from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
+from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig, refuse_unread
 from splatart_ns.plugin.pipeline import StagePipeline
 from splatart_ns.plugin.semantic_run import find_semantic_runs, read_state
 from splatart_ns.rasterize.render import render
@@ -163,6 +163,12 @@ class PosePipeline(StagePipeline):
         if test_mode != "val":  # a checkpoint brings everything
             return
         capture = self.datamanager.capture
+        if config.root is not None and config.root not in capture.parts.values():
+            raise InputError(
+                f"{capture.path} has no part '{config.root}'; choose --pipeline.root from "
+                f"{', '.join(capture.parts.values())}, or leave it out."
+            )
+        refuse_unread(self.model.config, "splatart-pose")
         runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
         if len(runs) != len(capture.states):
             raise InputError(

@@ -39,6 +39,7 @@ from splatart_ns.stages.semantic import (
     depth_loss,
     part_image,
     segmentation_loss,
+    spike_loss,
     trusted,
     vote_logits,
 )
@@ -206,7 +207,10 @@ class SemanticModel(SplatartModel):
             wrong = depth_loss(outputs["depth"][..., 0], outputs["accumulation"][..., 0], seen)
             losses["depth"] = self.config.depth_weight * wrong
         # Beside the piece that shows the object nothing is wrong: the means are those over the whole image.
-        return {name: batch.get("share", 1.0) * loss for name, loss in losses.items()}
+        losses = {name: batch.get("share", 1.0) * loss for name, loss in losses.items()}
+        if self.config.use_scale_regularization and self.step % 10 == 0:  # as often as Splatfacto
+            losses["scale_reg"] = 0.1 * spike_loss(self.scales, self.config.max_gauss_ratio)
+        return losses
 
     def _downscale_labels(self, labels: Tensor) -> Tensor:
         """Every d-th label, or depth: they must not mix."""

@@ -33,6 +33,13 @@ def depth_loss(depth: Tensor, accumulation: Tensor, seen: Tensor) -> Tensor:
     return ((seen > 0) * accumulation * (depth - seen).abs()).mean()
 
 
+def spike_loss(log_scales: Tensor, most: float) -> Tensor:
+    """By how much Gaussians' longest axes exceed `most` times their shortest, in the mean: [N, 3] to a number.
+    (PhysGaussian; Xie et al. 2024.)"""
+    ratio = (log_scales.amax(-1) - log_scales.amin(-1)).exp()
+    return (ratio - most).clamp_min(0).mean()
+
+
 def part_image(rendering: Rendering) -> Tensor:
     """The probability of background and every part at each pixel [C, H, W, P + 1].
 

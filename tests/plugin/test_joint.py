@@ -268,6 +268,12 @@ def test_a_root_that_is_no_part_is_told(tmp_path: Path, capture_dir: Path) -> No
         joint_pipeline(tmp_path, capture_dir, pose_state(), root="door")
 
 
+def test_an_option_of_training_on_images_is_refused(tmp_path: Path, capture_dir: Path, monkeypatch) -> None:
+    monkeypatch.setattr(joint_method.config.pipeline.model, "ssim_lambda", 0.3)
+    with pytest.raises(InputError, match="ssim-lambda is 0.3, but splatart-joint does not read it"):
+        joint_pipeline(tmp_path, capture_dir, pose_state())
+
+
 def test_the_adjoint_of_the_world_is_the_covariances_map() -> None:
     # A rigid change of world (scale 1) is the adjoint of a translation.
     rigid = Normalization(NORMALIZATION.centre, 1.0)

@@ -11,7 +11,9 @@ from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 
 from splatart_ns.errors import InputError
-from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
+from splatart_ns.plugin.joint import JointModelConfig
+from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig, refuse_unread
+from splatart_ns.plugin.pose import PoseModelConfig
 from splatart_ns.splats.palette import part_colours
 
 GEOMETRY = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
@@ -53,6 +55,24 @@ def test_cameras_that_later_stages_would_not_know_of_are_not_optimised() -> None
 def test_a_bilateral_grid_is_refused() -> None:
     with pytest.raises(InputError, match="use-bilateral-grid is True, .* leave it out"):
         SplatartModelConfig(use_bilateral_grid=True).setup(scene_box=None, num_train_data=1, metadata={})
+
+
+def test_metrics_that_are_not_computed_are_refused() -> None:
+    with pytest.raises(InputError, match="color-corrected-metrics is True, .* leave it out"):
+        SplatartModelConfig(color_corrected_metrics=True).setup(scene_box=None, num_train_data=1, metadata={})
+
+
+@pytest.mark.parametrize(
+    "option", [{"use_scale_regularization": True}, {"ssim_lambda": 0.3}, {"sh_degree": 3}, {"cull_alpha_thresh": 0.5}]
+)
+def test_options_of_training_on_images_are_refused_where_it_is_over(option: dict) -> None:
+    refuse_unread(PoseModelConfig(), "splatart-pose")
+    refuse_unread(JointModelConfig(background_color="black", rasterize_mode="antialiased"), "splatart-joint")
+    ((name, value),) = option.items()
+    dashed = name.replace("_", "-")
+    for config in (PoseModelConfig, JointModelConfig):
+        with pytest.raises(InputError, match=f"--pipeline.model.{dashed} is {value}, but splatart-x does not read it"):
+            refuse_unread(config(**option), "splatart-x")
 
 
 def test_nothing_is_asked_of_the_network(semantic_trainer, capture_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:

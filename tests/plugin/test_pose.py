@@ -68,6 +68,14 @@ def pose_trainer(capture_dir, semantic_runs, tmp_path):
     return make
 
 
+def test_a_root_that_is_no_part_and_options_of_training_on_images_are_told(pose_trainer, monkeypatch):
+    with pytest.raises(InputError, match="has no part 'door'; choose --pipeline.root from base, lid"):
+        pose_trainer(root="door")
+    monkeypatch.setattr(pose_method.config.pipeline.model, "ssim_lambda", 0.3)
+    with pytest.raises(InputError, match="ssim-lambda is 0.3, but splatart-pose does not read it"):
+        pose_trainer()
+
+
 def test_poses_start_at_centroids(pose_trainer):
     T = pose_trainer(init="centroids").pipeline.model.poses.T().detach()
     assert torch.equal(T[..., :3, :3], torch.eye(3).double().expand(2, 2, 3, 3))

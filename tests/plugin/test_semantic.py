@@ -1,5 +1,6 @@
 import copy
 import json
+import math
 import shutil
 from dataclasses import replace
 
@@ -135,6 +136,20 @@ def test_gaussians_learn_from_depth(depth_capture_dir, semantic_trainer):
     assert pipeline.model._get_downscale_factor() == 2
     _, halved, _ = pipeline.get_train_loss_dict(0)
     assert float(halved["depth"]) == pytest.approx(float(losses["depth"]), rel=0.5)  # of another frame
+
+
+def test_splatfactos_scale_regularization_keeps_gaussians_round(capture_dir, semantic_trainer):
+    trainer = semantic_trainer(capture_dir)
+    model = trainer.pipeline.model
+    model.config.use_scale_regularization, model.config.max_gauss_ratio = True, 2.0
+    with torch.no_grad():
+        model.gauss_params["scales"][:, 0] = model.gauss_params["scales"][:, 1:].mean(1) + math.log(5)
+        model.gauss_params["scales"][:, 1:] = model.gauss_params["scales"][:, :1] - math.log(5)
+    model.step_cb(trainer.optimizers, 0)
+    losses = trainer.pipeline.get_train_loss_dict(0)[1]
+    assert float(losses["scale_reg"].detach()) == pytest.approx(0.1 * (5 - 2), rel=1e-4)
+    model.step_cb(trainer.optimizers, 5)
+    assert "scale_reg" not in trainer.pipeline.get_train_loss_dict(5)[1]
 
 
 def test_depth_is_not_read_where_nothing_learns(depth_capture_dir, semantic_trainer):

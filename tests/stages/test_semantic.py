@@ -13,6 +13,7 @@ from splatart_ns.stages.semantic import (
     ballots,
     part_image,
     segmentation_loss,
+    spike_loss,
     trusted,
     vote_logits,
 )
@@ -47,6 +48,11 @@ def test_unlabelled_pixels_do_not_count():
 
 def test_accumulation_loss_is_the_mean_difference():
     assert torch.isclose(accumulation_loss(torch.full((4, 4), 0.75), torch.ones(4, 4)), torch.tensor(0.25))
+
+
+def test_long_gaussians_cost_what_their_axes_differ_beyond_the_limit():
+    scales = torch.tensor([[1.0, 1, 1], [1, 2, 8], [3, 1, 3]])
+    assert float(spike_loss(scales.log(), 3.0)) == pytest.approx(5 / 3, rel=1e-5)
 
 
 def test_votes_find_the_parts_of_visible_gaussians():
