@@ -263,6 +263,7 @@ class JointPipeline(StagePipeline):
         )
         self.tree = doubted(shifted(self.tree, torch.from_numpy(normalization.centre)), state["_model.alike"])
         self.notes = [f"{capture.parts[part]}: {reason}" for part, reason in self.tree.unattached.items()]
+        self.notes += self.tree.contradicted.values()
         self.notes += [other_parent_note(j, capture.parts) for j in self.tree.joints if j.other is not None]
         for note in self.notes:
             CONSOLE.log(note, markup=False)

@@ -47,6 +47,9 @@ class KinematicTree:
     unattached: dict[int, str] = field(default_factory=dict)
     """Parts that no joint explains, each with the reason. They hang on nothing and move with the root, but for those
     that others hang on: they have a free joint."""
+    contradicted: dict[int, str] = field(default_factory=dict)
+    """Parts that hang by a joint of a type that the user told and that explains their motions far worse than another
+    type, each with a sentence."""
 
     @property
     def movable(self) -> list[Joint]:

@@ -72,7 +72,7 @@ def told_pair(
     excluded: Collection[str] = (),
     **settings: Any,
 ) -> dict[tuple[int, int], JointFit]:
-    """The joints, both ways round, of a pair of parts as the user wants them.
+    """The joints, both ways round, of a pair of parts as the user wants them, accepted or not.
 
     `excluded`: the types that other constraints rule out; `settings` as in `fit_pairs`.
     """
@@ -91,7 +91,7 @@ def told_pair(
         fits = {(a, b): free_joint(inverse(motions[a].double()) @ motions[b].double(), points[b]) for a, b in fits}
     elif kind is not None:
         fits = fit_pairs(points, motions, object_radius, types=[kind], **settings)
-    return {edge: replace(fit, accepted=True) for edge, fit in fits.items()}
+    return fits
 
 
 def descend_pairs(

@@ -125,7 +125,7 @@ def infer_tree(
         joints = descend_pairs(points, motions, radius, epsilon)
     else:
         joints = fit_pairs(points, motions, radius, render_ratios=render_ratios, **certainty)
-    joints = _as_told(constraints, joints, points, motions, radius, **certainty)
+    joints, contradicted = _as_told(constraints, joints, points, motions, radius, names, **certainty)
     # A part of which nothing tells where it is at state 0 hangs on others, and nothing hangs on it.
     joints = {(a, b): fit for (a, b), fit in joints.items() if a not in lost}
     blind = {(a, b) for a, b in joints if leads_blindly(known[a], known[b]) and required.get(b) != a}
@@ -146,7 +146,10 @@ def infer_tree(
     tree = build_tree(sorted(points), joints | groups, contacts, root, radius, required, names)
     reached = reached_from([(j.parent, j.child) for j in tree.joints if (j.parent, j.child) not in groups], root)
     reasons = {base: _why_unattached(base, reached, joints, radius, names) for _, base in groups}
-    tree = replace(tree, unattached=tree.unattached | reasons)
+    reasons = tree.unattached | reasons
+    exchanged = {p: _exchanged(p, points, motions) for p in reasons}
+    reasons = {p: why + _exchange_hint(p, exchanged[p], names) for p, why in reasons.items()}
+    tree = replace(tree, unattached=reasons, contradicted=contradicted)
     if method == "descent":  # its fits have no scores
         return replace(tree, joints=[replace(j, other=None) for j in tree.joints])
     places, motions, known = place_unseen(tree, motions, known)
@@ -176,15 +179,22 @@ def _as_told(
     points: Mapping[int, Tensor],
     motions: Mapping[int, Tensor],
     radius: float,
+    names: Mapping[int, str],
     **certainty: Any,
-) -> dict[tuple[int, int], JointFit]:
-    """The joints by (parent, child), with those between parts that the user knows of as `told_pair` says."""
+) -> tuple[dict[tuple[int, int], JointFit], dict[int, str]]:
+    """The joints by (parent, child), with those between parts that the user knows of as `told_pair` says, and by part
+    in what the motions contradict the user."""
+    contradicted = {}
     for c in sorted(constraints, key=lambda c: not c.forbidden):
-        pair = {p: points[p] for p in (c.parent, c.child)}
+        edge, pair = (c.parent, c.child), {p: points[p] for p in (c.parent, c.child)}
         excluded = {d.type for d in constraints if d.forbidden and {d.parent, d.child} == set(pair)}
         told = told_pair(c, joints, pair, motions, radius, excluded, **certainty)
+        if not c.forbidden:
+            if c.type is not None and _fits_far_worse(told[edge], joints[edge]):
+                contradicted[c.child] = _why_contradicted(edge, told[edge], joints[edge], radius, names)
+            told = {edge: replace(fit, accepted=True) for edge, fit in told.items()}
         joints = {edge: fit for edge, fit in joints.items() if set(edge) != set(pair)} | told
-    return joints
+    return joints, contradicted
 
 
 def _pose_errors(
@@ -412,8 +422,11 @@ def _why_unattached(
     object_radius: float,
     names: Mapping[int, str],
 ) -> str:
+    # Either way round, as the parts' points differ; what one leaves may be within the limit.
     tried = [
-        (fit.residual / object_radius, p, fit.type) for (p, c), fit in joints.items() if c == part and p in reached
+        (max(fit.residual, joints.get((c, p), fit).residual) / object_radius, p, fit.type)
+        for (p, c), fit in joints.items()
+        if c == part and p in reached
     ]
     if not tried:
         return f"No joint was fitted between {names[part]} and any part of the tree."
@@ -422,3 +435,36 @@ def _why_unattached(
         f"No joint explains how {names[part]} moves: the best, {kind} on {names[parent]}, leaves {residual:.1%} of the "
         "object's radius, more than the limit and than noise would."
     )
+
+
+def _fits_far_worse(told: JointFit, free: JointFit) -> bool:
+    """Whether a joint of the type that the user told is none that would be accepted, but one of another type is."""
+    return not told.accepted and free.accepted and free.type != told.type
+
+
+def _why_contradicted(
+    edge: tuple[int, int], told: JointFit, free: JointFit, object_radius: float, names: Mapping[int, str]
+) -> str:
+    parent, child = (names[p] for p in edge)
+    return (
+        f"--joint '{child}:{parent}={told.type}' leaves {told.residual / object_radius:.1%} of the object's radius "
+        f"unexplained; {free.type} would leave {free.residual / object_radius:.1%}."
+    )
+
+
+def _exchanged(part: int, points: Mapping[int, Tensor], motions: Mapping[int, Tensor]) -> int | None:
+    """A part that in some state lies nearer to where `part` was in the first one than to where it was itself, as
+    `part` does to it."""
+    centres = {p: x.double().mean(0) for p, x in points.items()}
+    places = {p: transform_points(motions[p].double(), centre[None])[:, 0] for p, centre in centres.items()}
+
+    def nearer(a: int, b: int) -> Tensor:
+        return (places[a] - centres[b]).norm(dim=-1) < (places[a] - centres[a]).norm(dim=-1)
+
+    return next((p for p in points if p != part and bool((nearer(part, p) & nearer(p, part)).any())), None)
+
+
+def _exchange_hint(part: int, other: int | None, names: Mapping[int, str]) -> str:
+    if other is None:
+        return ""
+    return f" In some state it lies where {names[other]} was, and {names[other]} where it was: are their ids exchanged?"

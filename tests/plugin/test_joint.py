@@ -253,6 +253,13 @@ def test_of_a_part_that_may_hang_on_another_the_report_tells_how_to_decide() -> 
     assert note.startswith("knob hangs on base, but may as well hang on lid: --joint 'knob:lid' says so")
 
 
+def test_a_type_that_the_user_told_against_the_motions_is_kept_and_noted(tmp_path: Path, capture_dir: Path) -> None:
+    pipeline = joint_pipeline(tmp_path, capture_dir, pose_state(), root="lid", joints=("base:lid=prismatic",))
+    assert [joint.type for joint in pipeline.bundle.joints] == ["prismatic"]
+    (note,) = pipeline.notes
+    assert note.startswith("--joint 'base:lid=prismatic' leaves ") and "; revolute would leave 0" in note
+
+
 def test_an_unfinished_or_foreign_pose_run_is_refused(tmp_path: Path, capture_dir: Path) -> None:
     foreign = pose_state() | {"_model.poses.base": torch.eye(4).double().repeat(2, 3, 1, 1)}
     stage_1 = {name: value for name, value in pose_state().items() if "gauss_params" in name}

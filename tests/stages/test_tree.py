@@ -338,6 +338,33 @@ def test_the_user_decides_of_which_type_a_joint_is(kind):
     assert {j.child: j.fit.type for j in tree.joints} == {2: "prismatic", 3: kind} and not tree.unattached
 
 
+def test_a_type_that_explains_the_motion_far_worse_than_another_is_told():
+    points = {1: box((0, 0, 0), (1, 1, 0.2), 1), 2: box((0, 0, 0.15), (1, 1, 0.1), 2)}
+    truth = KinematicTree([1, 2], 1, [true_joint(1, 2, "revolute", X, (0, -0.5, 0.1))])
+    motions, names = motions_of(truth, torch.tensor([[0.0], [1.2]]).double()), {1: "base", 2: "lid"}
+    tree = infer_tree(points, motions, root=1, constraints=[JointConstraint(1, 2, "prismatic")], names=names)
+    assert [j.fit.type for j in tree.joints] == ["prismatic"]
+    left = tree.joints[0].fit.residual / object_radius(points)
+    assert tree.contradicted == {
+        2: f"--joint 'lid:base=prismatic' leaves {left:.1%} of the object's radius unexplained; revolute would leave "
+        "0.0%."
+    }
+    for told in (JointConstraint(1, 2, "revolute"), JointConstraint(1, 2, "free"), JointConstraint(1, 2)):
+        assert not infer_tree(points, motions, root=1, constraints=[told]).contradicted
+
+
+def test_ids_that_may_be_exchanged_in_a_state_are_told_where_no_joint_explains_them():
+    points, truth, q = drawers(2)
+    motions = motions_of(truth, q)
+    assert not infer_tree(points, motions).unattached
+    throw = se3_exp(torch.tensor([0.0, 0, 0, 0.3, 0.4, -0.5]).double())
+    for part, other in ((2, 3), (3, 2)):
+        about = [from_rotation_translation(torch.eye(3).double(), points[p].mean(0)) for p in (other, part)]
+        motions[part] = torch.stack([torch.eye(4).double(), about[0] @ throw @ inverse(about[1])])
+    tree = infer_tree(points, motions, root=1, names={1: "body", 2: "upper", 3: "lower"})
+    assert tree.unattached[2].endswith("it lies where lower was, and lower where it was: are their ids exchanged?")
+
+
 def test_a_type_can_be_excluded():
     points, truth, q = drawers(4)
     excluded = JointConstraint(1, 3, "prismatic", forbidden=True)
