@@ -46,6 +46,11 @@ _ONE_UNIT = 1.2
 _STAYS, _MOVES = 0.93, 0.6
 """A part rests from one state to another if so much of it is at the same place, and moves if less than the second; in
 between, another part may have moved before it."""
+_OTHER_SIZE, _WELL_SEEN, _LABELS_SHOW = 1.1, 100, 0.9
+"""The intrinsics of two states differ if all parts, two at least, measure more or less by this factor in one of them.
+Parts count that have so many points in both, and labelled frames must show so much of what all show. In 33 sound
+captures the part that changed least did by a factor of 1.04 at most; with one state's fl_x and fl_y 1.2 times what they
+are, or as much less, by 1.14 to 1.24."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +123,19 @@ class _Evidence:
     size: float = 0.0
     votes: PartVotes | None = None
 
+    def part_sizes(self, parts: Sequence[int]) -> Tensor:
+        """The spread of each part's points in the capture's unit, NaN where they are few: [P]."""
+        own = self.votes.parts()
+        points = [self.points[own == part].double() for part in parts]
+        spreads = [x.std(0).norm() if len(x) >= _WELL_SEEN else torch.tensor(math.nan).double() for x in points]
+        return torch.stack(spreads) / self.normalization.scale
+
+    def shown_by_labels(self) -> float:
+        """The share of the surface that views show which labelled views show, too."""
+        seen = {id(view): visible(view, self.points, self.size) for view in self.views}
+        labelled = torch.stack([seen[id(view)] for view in self.labelled]).any(0)
+        return float(labelled.sum() / torch.stack([*seen.values()]).any(0).sum().clamp_min(1))
+
     @property
     def labelled(self) -> list[View]:
         return [view for view in self.views if view.labels is not None]
@@ -136,7 +154,7 @@ def examine(path: Path | str, suggest: int = 0) -> Examination:
     - Labels: frames that contradict the other frames on a part, by votes on the hull's surface; outlines of labels
       against silhouettes; parts that few labelled frames show.
     - States: whether a part moved, and whether one stayed, between the first state and the others, if these share a
-      world.
+      world; whether parts are as large in the others as in the first.
 
     `suggest` frames to label next are chosen one after the other: the training frame that adds most to
     sum_v w_v (1 - 2^-n_v), where n_v labelled frames see the point v of the surface and w_v = 1 / (points of its part),
@@ -158,8 +176,11 @@ def examine(path: Path | str, suggest: int = 0) -> Examination:
             one.votes = vote(one.labelled, one.points, one.size, num_parts)
             problems.extend(_check_votes(capture, one))
         problems.extend(_check_coverage(capture, one))
-    for other in evidence[1:] if capture.worlds == "shared" else ():
-        problems.extend(_check_motion(capture, evidence[0], other))
+    for other in evidence[1:]:
+        elsewhere = list(_check_motion(capture, evidence[0], other)) if capture.worlds == "shared" else []
+        problems.extend(elsewhere)
+        if not elsewhere and capture.worlds != "similar":
+            problems.extend(_check_sizes(capture, evidence[0], other))
     return Examination(
         capture=capture,
         problems=tuple(sorted(dict.fromkeys(problems), key=lambda p: p.severity != "error")),
@@ -375,6 +396,22 @@ def _check_motion(capture: Capture, first: _Evidence, other: _Evidence) -> Itera
         found = f"no part is where it was in {first.state.name}: the states may have different worlds or labels"
         mend = f"{OTHER_WORLDS_MEND}, or correct the ids of the parts"
         yield Problem("warning", place, found, mend)
+
+
+def _check_sizes(capture: Capture, first: _Evidence, other: _Evidence) -> Iterator[Problem]:
+    """A rigid part is as large in all states: where none is, lengths on the images are not what they are told to be."""
+    if first.votes is None or other.votes is None:
+        return
+    times = other.part_sizes(list(capture.parts)) / first.part_sizes(list(capture.parts))
+    times = times[times.isfinite()]
+    differ = len(times) > 1 and bool((times > _OTHER_SIZE).all() or (times < 1 / _OTHER_SIZE).all())
+    # Of a part that labelled frames show from one side alone, more may be in sight in one state.
+    if differ and min(first.shown_by_labels(), other.shown_by_labels()) > _LABELS_SHOW:
+        found = f"parts measure {float(times.median()):.2f} times what they do in {first.state.name}"
+        mend = (
+            f"correct the fl_x and fl_y of one of the two: another lens, or another resolution; or {OTHER_WORLDS_MEND}"
+        )
+        yield Problem("warning", capture.path / other.state.name, found, mend)
 
 
 # ---------------------------------------------------------------------------------------------- what to label next

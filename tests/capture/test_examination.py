@@ -115,6 +115,12 @@ DEFECTS = {
         lambda c: change_poses(c / "state_01", lambda T: np.block([[T[:3, :3], 2 * T[:3, 3:]], [T[3:]]])),
         {"state_01": "no part is where it was in state_00: the states may have different worlds"},
     ),
+    "a state of another lens": (
+        lambda c: change_json(
+            c / "state_01/transforms.json", lambda m: m.update(fl_x=1.2 * m["fl_x"], fl_y=1.2 * m["fl_y"])
+        ),
+        {"state_01": "parts measure 0."},
+    ),
     "no motion": (
         lambda c: [shutil.rmtree(c / "state_01"), shutil.copytree(c / "state_00", c / "state_01")],
         {"state_01": "no part seems to have moved since state_00"},
