@@ -15,7 +15,15 @@ from torch import Tensor
 
 from splatart_ns.capture.capture import UNLABELLED, Capture, Frame, Normalization, Problem, State
 from splatart_ns.capture.check import check_capture
-from splatart_ns.capture.hull import carve, fitting_views, project, silhouette, visible
+from splatart_ns.capture.hull import (
+    POSES_MEND,
+    carve,
+    contradiction,
+    fitting_views,
+    project,
+    silhouette,
+    visible,
+)
 from splatart_ns.capture.part_votes import Ballot, PartVotes, read_ballots, vote
 from splatart_ns.capture.seen_surface import LEAST_CONFIRMED, measured_surface, object_pixels
 from splatart_ns.capture.view import View, load_view
@@ -176,6 +184,9 @@ def examine(path: Path | str, suggest: int = 0) -> Examination:
             one.votes = vote(one.labelled, one.points, one.size, num_parts)
             problems.extend(_check_votes(capture, one))
         problems.extend(_check_coverage(capture, one))
+    if any(problem.mend == POSES_MEND and problem.severity == "error" for problem in problems):
+        # Wrong axes make cameras look anywhere.
+        problems = [problem for problem in problems if problem.mend != OTHER_WORLDS_MEND]
     for other in evidence[1:]:
         elsewhere = list(_check_motion(capture, evidence[0], other)) if capture.worlds == "shared" else []
         problems.extend(elsewhere)
@@ -227,17 +238,14 @@ def _carve(capture: Capture, one: _Evidence) -> Iterator[Problem]:
         return
     carving = carve([one.views[i] for i in known])
     place = capture.path / one.state.name
-    mend = "check that poses are camera-to-world in OpenGL axes, the intrinsics, and that masks are white inside"
-    agreement = float((carving.accepted.sum(0) * carving.seen).max()) / len(known)
-    if agreement < 0.75:
-        found = f"the silhouettes contradict each other: no point lies inside more than {agreement:.0%} of them"
-        yield Problem("error", place, found, mend)
+    if (found := contradiction(carving)) is not None:
+        yield Problem("error", place, found, POSES_MEND)
         return
     fitting = fitting_views(carving)
     if fitting is None:
         outside = float(carving.uncovered(torch.ones(len(known), dtype=torch.bool)).median())
         found = f"the silhouettes do not fit: {outside:.0%} of a frame's lies inside no point that all frames accept"
-        yield Problem("error" if outside > 0.5 else "warning", place, found, mend)
+        yield Problem("error" if outside > 0.5 else "warning", place, found, POSES_MEND)
         return
     odd = [known[i] for i in torch.nonzero(~fitting).flatten().tolist()]
     for frame in (one.frames[i] for i in odd):

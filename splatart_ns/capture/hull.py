@@ -17,6 +17,8 @@ from splatart_ns.geometry.camera import project_points
 
 UNCOVERED = 0.03
 """Silhouettes fit each other where no more of each than this share lies outside the hull's projection."""
+POSES_MEND = "check that poses are camera-to-world in OpenGL axes, the intrinsics, and that masks are white inside"
+_LEAST_AGREEMENT = 0.75
 _COARSE, _FINE = 40, 64
 _MOST_ODD = 0.25
 _SUSPECTS = 3
@@ -83,6 +85,14 @@ def carve(views: Sequence[View]) -> Carving:
             break
         low, high = points[full].amin(0) - 2 * size, points[full].amax(0) + 2 * size
     return Carving(views, points, size, accepted, seen)
+
+
+def contradiction(carving: Carving) -> str | None:
+    """What is wrong with silhouettes of which too few have a point in common; else None."""
+    agreement = float((carving.accepted.sum(0) * carving.seen).max()) / len(carving.views)
+    if agreement >= _LEAST_AGREEMENT:
+        return None
+    return f"the silhouettes contradict each other: no point lies inside more than {agreement:.0%} of them"
 
 
 def fitting_views(carving: Carving) -> Tensor | None:

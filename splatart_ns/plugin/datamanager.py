@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,9 +13,10 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
-from splatart_ns.capture.capture import UNLABELLED, Capture
+from splatart_ns.capture.capture import UNLABELLED, Capture, State
+from splatart_ns.capture.hull import POSES_MEND, carve, contradiction, silhouette
 from splatart_ns.capture.seen_surface import SeenSurface, measured_surface
-from splatart_ns.capture.view import View, Window, load_points, load_view
+from splatart_ns.capture.view import View, Window, load_points, load_view, load_views
 from splatart_ns.errors import InputError
 from splatart_ns.machine import num_cores
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
@@ -145,6 +146,8 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
                 self.train_dataset.metadata["points3D_around"] = len(around.xyz)
         else:
             self.slack, hull = slack(views)
+            if hull is None:
+                self._require_agreement(state)
             # A cloud of structure from motion has most of its points around the object, and few on it.
             if hull is not None:
                 points = seed_points(views, num_parts, count, generator, hull, seen_surface(views, *hull))
@@ -152,6 +155,14 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         if points is not None:
             self.train_dataparser_outputs.metadata.update(points3D_xyz=points.xyz, points3D_rgb=points.rgb)
             self.train_dataset.metadata["points3D_normals"] = points.normals
+
+    def _require_agreement(self, state: State) -> None:
+        """Raise `InputError` where most silhouettes of a state have no point in common in the place where it looks."""
+        there = replace(self.capture, normalization=state.normalization())
+        views = load_views(there, state, downscale=self.train_dataset.downscale)
+        known = [view for view in views if (mask := silhouette(view)) is not None and mask.any() and not mask.all()]
+        if len(known) > 2 and (found := contradiction(carve(known))) is not None:
+            raise InputError(f"{self.capture.path / state.name}: {found}; {POSES_MEND}.")
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """A training frame and its camera: the piece around the object, where the image says which that is.

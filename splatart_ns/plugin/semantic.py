@@ -341,7 +341,12 @@ class SemanticPipeline(StagePipeline):
         before, now = self.datamanager.slack.pixels, self._slack.pixels
         self.findings["cameras"] = {**asdict(change), "pixels": shift, "slack_pixels": [before, now]}
         moved = f"turned by {change.degrees:.2f} deg and moved by {change.percent:.2f} % of their distance"
-        if before > 0:
+        if 0 < before <= now:
+            why = (
+                f"contradict each other by {now} pixels, and refining them did not help: they were {moved}; check "
+                "poses, intrinsics and masks"
+            )
+        elif before > 0:
             why = f"contradicted each other by {before} pixels; they were {moved}, and now do so by {now}"
         else:
             why = f"were {moved}, so that images agree: {shift:.1f} pixels where they look"

@@ -56,7 +56,7 @@ def read_state(
     if not bool((splat.part_ids > 0).any()):
         raise InputError(
             f"{run} learned no parts: no Gaussian fits the silhouettes and labels of {capture.states[state].name}; "
-            f"`splatart check {capture.path}` tells wrong poses, masks and worlds (--worlds); else train longer."
+            f"`splatart check {capture.path}` tells wrong poses, axes, masks and worlds (--worlds); else train longer."
         )
     views = [view.to(device) for view in learned_views(capture, state, checkpoint, downscale)]
     views = [with_silhouette(view) or rendered_silhouette(view, splat) for view in views]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from splatart_ns.capture.check import check_capture
 from splatart_ns.capture.digest import capture_digest
 from splatart_ns.capture.examination import as_json, as_text, examine
 from splatart_ns.capture.formats import load_capture
@@ -138,6 +139,14 @@ def test_a_defect_is_told_and_its_frame_named(capture, name):
     assert all(p.mend for p in problems)
     blamed = {str(p.file.relative_to(capture)) for p in problems if p.file.suffix == ".png"}
     assert blamed <= set(expected)
+
+
+def test_wrong_axes_are_not_called_another_world(capture):
+    for state in ("state_00", "state_01"):
+        change_poses(capture / state, lambda T: T @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    change_poses(capture / "state_01", lambda T: np.vstack([np.c_[T[:3, :3], 4 * T[:3, 3:]], T[3:]]))
+    assert any("worlds" in p.mend for p in check_capture(capture))
+    assert not any("worlds" in p.mend for p in examine(capture).problems)
 
 
 def swapped_at_the_left(labels):

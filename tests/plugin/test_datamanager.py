@@ -215,6 +215,18 @@ def test_batches_have_the_depth_that_other_frames_confirm(capture_dir: Path, dep
     assert "depth" not in batch and "depth" not in camera.metadata
 
 
+@pytest.mark.parametrize("change", [lambda T: T @ np.diag([1.0, -1, -1, 1]), np.linalg.inv])
+def test_poses_of_another_convention_are_refused_before_anything_learns(capture_dir: Path, tmp_path: Path, change):
+    capture = shutil.copytree(capture_dir, tmp_path / "capture")
+    for file in capture.glob("state_*/transforms.json"):
+        meta = json.loads(file.read_text())
+        for frame in meta["frames"]:
+            frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+        file.write_text(json.dumps(meta))
+    with pytest.raises(InputError, match="state_01: the silhouettes contradict each other.*camera-to-world in OpenGL"):
+        manage(capture, seed_gaussians=200)
+
+
 def framed(view: View, border: int) -> View:
     """The view with nothing around it."""
     pixels = {name: getattr(view, name) for name in ("rgb", "alpha", "labels")}

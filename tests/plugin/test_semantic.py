@@ -236,6 +236,16 @@ def test_refined_cameras_stay_after_an_evaluation_which_loads_images_again(captu
     assert torch.equal(pipeline.datamanager.train_dataset.cameras.camera_to_worlds, refined)
 
 
+@pytest.mark.parametrize("now, told", [(3, "and now do so by 3."), (13, "refining them did not help")])
+def test_cameras_that_contradict_each_other_as_much_as_before_are_not_called_mended(
+    capture_dir, semantic_trainer, now, told
+):
+    pipeline = semantic_trainer(capture_dir).pipeline
+    pipeline.datamanager.slack, pipeline._slack = Slack(pixels=13), Slack(pixels=now)
+    pipeline._note_cameras()
+    assert told in pipeline.notes[-1]
+
+
 @pytest.mark.parametrize("pixels, moved", [(0.3, False), (1.0, True)])
 def test_cameras_of_images_without_silhouettes_move_if_that_is_by_pixels(
     opaque_capture_dir, semantic_trainer, monkeypatch, pixels, moved
