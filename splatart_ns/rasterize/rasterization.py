@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-import math
 from typing import Any, Literal, get_args
 
 import torch
@@ -13,10 +12,17 @@ from torch import Tensor
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.spherical_harmonics import sh_basis
 from splatart_ns.rasterize import torch_backend
+from splatart_ns.rasterize.arguments import (
+    Arguments,
+    RasterizeMode,
+    RenderMode,
+    image_size,
+    require_finite,
+    require_modes,
+)
 from splatart_ns.rasterize.projection import project
 
 Backend = Literal["auto", "torch", "numba", "gsplat"]
-RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 
 
 _chosen: Backend = "auto"
@@ -85,7 +91,7 @@ def rasterization(
     render_mode: RenderMode = "RGB",
     sparse_grad: bool = False,
     absgrad: bool = False,
-    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    rasterize_mode: RasterizeMode = "classic",
     channel_chunk: int = 32,
     distributed: bool = False,
     camera_model: str = "pinhole",
@@ -123,7 +129,8 @@ def rasterization(
 
     Raises:
         NotImplementedError: For a camera model but pinhole, distributed rendering or given covariances.
-        ValueError: A tensor holds NaN or infinity, or the backend is unknown or not for these tensors.
+        ValueError: A tensor has another shape, or holds NaN or infinity; a mode or the backend is unknown, or the
+            backend is not for these tensors.
     """
     for name, is_default in (
         (f"camera_model={camera_model!r}", camera_model == "pinhole"),
@@ -132,9 +139,20 @@ def rasterization(
     ):
         if not is_default:
             raise NotImplementedError(f"rasterization: {name} is not supported")
+    require_modes(render_mode=render_mode, rasterize_mode=rasterize_mode)
+    width, height = image_size(width, height)
+    with_depth, with_color = render_mode.endswith("D"), render_mode.startswith("RGB")
+    arguments = _gaussians(means, quats, scales, opacities, viewmats)
+    arguments.require(Ks=(Ks, ("C", 3, 3)))
+    if sh_degree is None:
+        arguments.require_colors(colors)
+    else:
+        arguments.require_harmonics("colors", colors, sh_degree)
+    if backgrounds is not None and with_color:
+        arguments.require(backgrounds=(backgrounds, ("C", colors.shape[-1])))
     backend = _resolve(backend, means)
     tensors = dict(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
-    _require_finite(**tensors, viewmats=viewmats, Ks=Ks, backgrounds=backgrounds)
+    require_finite(**tensors, viewmats=viewmats, Ks=Ks, backgrounds=backgrounds)
     if backend == "gsplat":
         import gsplat
 
@@ -163,7 +181,6 @@ def rasterization(
     if sh_degree is not None:
         colors = _sh_colors(means, colors, viewmats, sh_degree, backend)
 
-    with_depth, with_color = render_mode.endswith("D"), render_mode.startswith("RGB")
     channels = [colors.expand(C, -1, -1)] if with_color else []
     if with_depth:
         channels.append(depths[..., None])
@@ -221,6 +238,9 @@ def rasterize_neighbours(
     Returns:
         Colours over black and accumulation [C, H, W, 4], without gradients.
     """
+    width, height = image_size(width, height)
+    shapes = dict(K=(K, (3, 3)), colors=(colors, ("C", "N", 3)))
+    _gaussians(means, quats, scales, opacities, viewmats).require(**shapes)
     backend = _resolve(backend, means)
     Ks = K.expand(len(viewmats), 3, 3)
     if backend != "numba":
@@ -230,9 +250,7 @@ def rasterize_neighbours(
         return rasterization(means, quats, scales, opacities, channels, *camera, eps2d=eps2d, backend=backend)[0]
     from splatart_ns.rasterize import numba_backend, numba_projection
 
-    _require_finite(
-        means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, viewmats=viewmats, Ks=K
-    )
+    require_finite(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, viewmats=viewmats, Ks=K)
     radii, means2d, depths, conics, _ = numba_projection.project(
         means, quats, scales, viewmats, Ks, width, height, eps2d
     )
@@ -244,7 +262,8 @@ def sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int, backend:
 
     `sh` is [N, K, 3] or [C, N, K, 3], K >= (degree + 1)^2. `backend` as in `rasterization`.
     """
-    _require_finite(means=means, sh=sh, viewmats=viewmats)
+    Arguments(means, viewmats).require_harmonics("sh", sh, degree)
+    require_finite(means=means, sh=sh, viewmats=viewmats)
     return _sh_colors(means, sh, viewmats, degree, _resolve(backend, means))
 
 
@@ -276,18 +295,10 @@ def _resolve(backend: Backend, means: Tensor) -> Backend:
     return backend
 
 
-def _require_finite(**tensors: Tensor | None) -> None:
-    tensors = {name: tensor.detach() for name, tensor in tensors.items() if tensor is not None}
-    # A sum is the fastest look at every value, and is not finite unless all are; one transfer fetches all sums.
-    sums = torch.stack([tensor.sum() for tensor in tensors.values()]).tolist()
-    for (name, tensor), total in zip(tensors.items(), sums, strict=True):
-        if not math.isfinite(total):
-            bad = (~tensor.isfinite()).nonzero()
-            if len(bad):
-                where = ", ".join(map(str, bad[0].tolist()))
-                raise ValueError(
-                    f"rasterization: {name}[{where}] is {tensor[tuple(bad[0])]}, one of {len(bad)} not finite"
-                )
+def _gaussians(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor) -> Arguments:
+    arguments = Arguments(means, viewmats)
+    arguments.require(quats=(quats, ("N", 4)), scales=(scales, ("N", 3)), opacities=(opacities, ("N",)))
+    return arguments
 
 
 def _steps(backend: Backend):

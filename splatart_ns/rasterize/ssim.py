@@ -40,6 +40,9 @@ class _Similarity(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, image, target, l1_factor, ssim_factor):
+        if image.shape != target.shape or image.ndim != 3 or image.shape[2] != 3:
+            found = f"image has the shape {list(image.shape)} and target {list(target.shape)}"
+            raise ValueError(f"ssim: {found}; give [H, W, 3] of both")
         function = _value_and_gradient
         if has_numba() and image.device.type == "cpu" and image.dtype == torch.float32:
             function = _value_and_gradient_numba

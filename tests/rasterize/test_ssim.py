@@ -102,3 +102,12 @@ def test_images_may_be_views_and_need_no_gradient():
     value = ssim(whole[..., :3], target)
     assert not value.requires_grad
     assert value == ssim(image, target)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(20, 29, 3), (15, 30, 3), (20, 30, 4), (20, 30)])
+def test_shapes_that_differ_are_named(dtype, shape):
+    image, other = torch.rand(20, 30, 3, dtype=dtype), torch.rand(shape, dtype=dtype)
+    for one, two in ((image, other), (other, image), *([] if shape[-1] == 3 else [(other, other)])):
+        with pytest.raises(ValueError, match=r"image has the shape .*; give \[H, W, 3\] of both"):
+            ssim(one, two)
