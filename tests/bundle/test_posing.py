@@ -60,6 +60,13 @@ def test_a_batch_of_values_gives_the_motions_one_by_one(kind):
         ("revolute", [0.1, math.nan], "not finite"),
         ("revolute", 10**400, "are no numbers"),
         ("revolute", [[0.1, 0.2], [0.3]], "are no numbers"),
+        ("revolute", np.array([0.1, 1j]), "are no numbers"),
+        ("revolute", np.complex128(1j), "are no numbers"),
+        ("revolute", [np.complex128(1j)], "are no numbers"),
+        ("revolute", torch.tensor(1j), "are no numbers"),
+        ("revolute", np.ma.masked_array([0.1, 0.2], [False, True]), "are no numbers"),
+        ("revolute", [np.ma.masked], "are no numbers"),
+        ("revolute", torch.tensor([0.1]).to_sparse(), "are no numbers"),
     ],
 )
 def test_a_value_that_cannot_be_is_refused(kind, value, found):
@@ -76,6 +83,23 @@ def test_values_are_read_from_views_of_arrays_and_lists_of_tensors():
     T = joint_motion(joint("revolute"), [value, torch.tensor(0.2)])
     (slope,) = torch.autograd.grad(T.sum(), value)
     assert T.shape == (2, 4, 4) and slope != 0
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        np.array(0.3),
+        np.array(0.3, ">f8"),
+        np.ma.masked_array(0.3, False),
+        np.array(0.3, np.longdouble),
+        np.float64(0.3),
+        torch.tensor(0.3, dtype=D),
+    ],
+)
+def test_one_number_in_any_wrapping_is_no_batch(value):
+    assert torch.equal(joint_motion(joint("revolute"), value), joint_motion(joint("revolute"), 0.3))
+    batch = joint_motion(joint("revolute"), [value, value])
+    assert batch.shape == (2, 4, 4) and torch.equal(batch[1], joint_motion(joint("revolute"), 0.3))
 
 
 def test_observed_values_give_the_observed_motions(bundle):
