@@ -59,7 +59,8 @@ class Camera:
 
 
 def _pose(value: object) -> Tensor:
-    T = _matrices("T_world_camera", value, 4)
+    T = _numbers("T_world_camera", value)
+    _require_matrices("T_world_camera", T, 4)
     R, last = T[..., :3, :3], T[..., 3, :]
     rigid = torch.allclose(R @ R.mT, torch.eye(3).to(T), atol=1e-4) and bool((torch.linalg.det(R) > 0).all())
     if not rigid or not torch.equal(last, T.new_tensor([0, 0, 0, 1]).expand_as(last)):
@@ -68,10 +69,11 @@ def _pose(value: object) -> Tensor:
 
 
 def _intrinsics(value: object) -> Tensor:
-    if isinstance(value, list | tuple | np.ndarray | Tensor) and len(value) == 4:
-        fx, fy, cx, cy = value
-        value = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
-    K = _matrices("K", value, 3)
+    K = _numbers("K", value)
+    if K.shape == (4,):
+        (fx, fy, cx, cy), (zero, one) = K, K.new_tensor([0, 1])
+        K = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).view(3, 3)
+    _require_matrices("K", K, 3)
     pinhole = K.clone()
     pinhole[..., [0, 1], [1, 0]] = 0
     pinhole[..., 2, :] = K.new_tensor([0, 0, 1])
@@ -82,17 +84,19 @@ def _intrinsics(value: object) -> Tensor:
     return K
 
 
-def _matrices(name: str, value: object, size: int) -> Tensor:
+def _numbers(name: str, value: object) -> Tensor:
     try:
-        tensor = as_float64(value)
+        return as_float64(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"the camera's {name} is {value!r}; give numbers") from error
+
+
+def _require_matrices(name: str, tensor: Tensor, size: int) -> None:
     if tensor.ndim not in (2, 3) or tensor.shape[-2:] != (size, size):
         wanted = f"give [{size}, {size}] or [B, {size}, {size}]"
         raise InputError(f"the camera's {name} has the shape {list(tensor.shape)}; {wanted}")
     if not tensor.isfinite().all():
         raise InputError(f"the camera's {name} has a number that is not finite; give finite numbers")
-    return tensor
 
 
 def bounding_sphere(bundle: Bundle, configurations: Sequence[Mapping[str, JointValue]]) -> tuple[np.ndarray, float]:

@@ -77,6 +77,16 @@ def test_a_camera_takes_arrays_lists_and_tensors():
     assert Camera(np.tile(EYE, (5, 1, 1))[::-1], camera.K, np.int64(40), np.int32(32)).width == 40
 
 
+@pytest.mark.parametrize("count", [1, 3, 4, 5])
+def test_any_number_of_intrinsics_is_a_batch(count):
+    K = np.array([[50.0, 0, 20], [0, 60, 16], [0, 0, 1]])
+    for batch in (np.stack([K] * count), [K] * count, torch.from_numpy(np.stack([K] * count))):
+        assert Camera(EYE, batch, 40, 32).batch == (count,)
+    four = torch.tensor([50.0, 60, 20, 16], dtype=torch.float64)
+    for numbers in (four, four.numpy(), tuple(four), tuple(np.array(x) for x in four.tolist())):
+        assert torch.equal(Camera(EYE, numbers, 40, 32).K, torch.from_numpy(K))
+
+
 @pytest.mark.parametrize(
     ("T", "K", "width", "found"),
     [
