@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -67,11 +67,12 @@ class Dataset:
         self.splat, self.options = splat, options or DatasetOptions()
         for name, least, most in (("states", 1, _MOST_STATES), ("resolution", 8, MOST_PIXELS), ("seed", 0, 2**128)):
             value = getattr(self.options, name)
-            if isinstance(value, bool) or not isinstance(value, int):
+            if isinstance(value, bool) or not isinstance(value, int | np.integer):
                 raise InputError(f"--{name} is {value!r}; give a whole number")
             if not least <= value <= most:
                 rule = f"{least} or more" if value < least else f"{most} or less"
                 raise InputError(f"--{name} is {value}; give {rule}")
+            self.options = replace(self.options, **{name: int(value)})
         if self.options.views not in get_args(Views):
             raise InputError(f"--views is {self.options.views!r}; give {' or '.join(get_args(Views))}")
         some = [self.configuration(state) for state in range(min(self.options.states, _SIZED_BY))]
@@ -92,6 +93,8 @@ class Dataset:
 
     def camera(self, index: int) -> Camera:
         """Where image `index` is taken from; the images of a state lie evenly around the object."""
+        if index < 0:  # there is no end to count from
+            raise IndexError(f"{index}: the images of a dataset are 0 and up")
         state, number = index % self.options.states, index // self.options.states
         start = np.random.default_rng([self.options.seed, 1, state]).uniform(size=2)
         height, turn = (start + (number + 1) / np.array([_PLASTIC, _PLASTIC**2])) % 1

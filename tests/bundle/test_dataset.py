@@ -46,6 +46,21 @@ def test_a_sample_is_made_again_from_its_number_alone(splat, dataset):
     assert other.q != again.q and not np.array_equal(other.rgba, again.rgba)
 
 
+def test_there_is_no_sample_before_the_first(dataset):
+    for ask in (dataset.__getitem__, dataset.camera):
+        with pytest.raises(IndexError, match="-1: the images of a dataset are 0 and up"):
+            ask(-1)
+
+
+def test_numpys_integers_are_numbers(splat, dataset, tmp_path):
+    options = DatasetOptions(states=np.uint8(3), resolution=np.int64(24), seed=np.int32(5))
+    again = Dataset(splat, options)
+    assert again.options == OPTIONS and json.dumps(vars(again.options))
+    assert np.array_equal(again[np.int64(4)].rgba, dataset[4].rgba)
+    with pytest.raises(InputError, match="--states is 2.0; give a whole number"):
+        Dataset(splat, DatasetOptions(states=np.float64(2)))
+
+
 def test_each_state_has_values_from_another_piece_of_the_observed_range(splat):
     states = 20
     many = Dataset(splat, DatasetOptions(states=states))
