@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,6 +31,8 @@ from splatart_ns.rasterize.rasterization import default_device
 from splatart_ns.rasterize.render import Rendering, render
 
 _AT_REST: Mapping[str, JointValue] = {}
+_BRIGHTEST = 8.0
+"""Colours are below it: those of renderings exceed 1 a little, and those of 0 to 255 by far."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class Picture:
     def over(self, background: Tensor | np.ndarray | Sequence[float]) -> Tensor:
         """Colours [B, H, W, 3] before a background [3] or an image [B, H, W, 3], clamped to 0..1.
 
-        Raises InputError for a background of another shape.
+        Raises InputError for a background of another shape, or of no colours (0 to 1, and a little beyond).
         """
         try:
             behind = as_float64(background).to(self.rgb)
@@ -59,6 +62,9 @@ class Picture:
             fits = False
         if not fits:
             raise InputError(f"the background is no colour [3] and no image {list(self.rgb.shape)}; give one of them")
+        if not bool((behind.abs() < _BRIGHTEST).all()):
+            extreme = float(behind.flatten()[behind.abs().argmax()])
+            raise InputError(f"the background has a number of {extreme:g}; give colours of 0 to 1")
         return (self.rgb + (1 - self.alpha[..., None]) * behind).clamp(0, 1)
 
     @property
@@ -125,7 +131,8 @@ class ArticulatedSplat:
         where they are in the configuration. The root stays. Differentiable in `q`.
 
         Raises:
-            InputError: an unknown joint, values of a wrong shape or not finite, batches of different sizes.
+            InputError: an unknown joint, values of a wrong shape, not finite or 1e18 and more, batches of different
+                sizes.
         """
         return configured_motions(self.bundle, q)
 
@@ -147,8 +154,10 @@ class ArticulatedSplat:
             depth, labels: Whether to render them; without, it is faster.
 
         Raises:
-            InputError: as `link_poses`; an unknown part.
+            InputError: as `link_poses`; an unknown part; what is no camera.
         """
+        if not isinstance(camera, Camera):
+            raise InputError(f"the camera is {camera!r}; give a Camera")
         shown = self._shown(parts)
         motions = self.link_poses(q)
         posed = motions[self.bundle.root].shape[:-2]
@@ -206,4 +215,6 @@ class ArticulatedSplat:
 
 def load(folder: Path | str, device: torch.device | str | None = None) -> ArticulatedSplat:
     """The object in a bundle's folder. Raises InputError where that cannot be read."""
+    if not isinstance(folder, str | os.PathLike):
+        raise InputError(f"the bundle's folder is {folder!r}; give its path")
     return ArticulatedSplat(load_bundle(Path(folder)), device)

@@ -17,6 +17,7 @@ from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.images import undistorted_camera
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import transform_points
+from splatart_ns.records import LONGEST
 
 _SAMPLES_PER_PART = 500
 _MIN_OPACITY = 0.1
@@ -65,6 +66,8 @@ def _pose(value: object) -> Tensor:
     rigid = torch.allclose(R @ R.mT, torch.eye(3).to(T), atol=1e-4) and bool((torch.linalg.det(R) > 0).all())
     if not rigid or not torch.equal(last, T.new_tensor([0, 0, 0, 1]).expand_as(last)):
         raise InputError("the camera's T_world_camera is no rigid motion; give [R t; 0 0 0 1]")
+    if not bool((T.abs() < LONGEST).all()):
+        raise InputError(f"the camera's T_world_camera has a number of {float(T.abs().max()):g}; give lengths")
     return T
 
 

@@ -14,6 +14,7 @@ from splatart_ns.bundle.bundle import JOINT_DOFS, Bundle, Joint
 from splatart_ns.bundle.numbers import as_float64
 from splatart_ns.capture.capture import Normalization
 from splatart_ns.errors import InputError
+from splatart_ns.records import LONGEST
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import joint_parameters as stage
 
@@ -24,7 +25,7 @@ JointValue = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | 
 def joint_motion(joint: Joint, value: JointValue) -> Tensor:
     """The child's motion relative to its parent [..., 4, 4] float64, canonical frame, at values (0 gives the identity).
 
-    On the CPU; differentiable in `value`. Raises InputError for values of the wrong shape, or not finite.
+    On the CPU; differentiable in `value`. Raises InputError for values of a wrong shape, not finite or 1e18 and more.
     """
     try:
         value = as_float64(value)
@@ -36,6 +37,8 @@ def joint_motion(joint: Joint, value: JointValue) -> Tensor:
         raise InputError(f"joint '{joint.name}' {found}; give [{dofs}], or [B, {dofs}] for B configurations")
     if not value.isfinite().all():
         raise InputError(f"joint '{joint.name}' has a value that is not finite; give radians or lengths")
+    if not bool((value.abs() < LONGEST).all()):
+        raise InputError(f"joint '{joint.name}' has a value of {float(value.abs().max()):g}; give radians or lengths")
     return stage.joint_motion(joint.type, joint.axis, joint.origin, joint.pitch, value)
 
 
@@ -47,6 +50,8 @@ def configured_motions(bundle: Bundle, q: Mapping[str, JointValue]) -> dict[str,
     The batches of the values broadcast. The root stays where it is at state 0, and so do parts that hang on nothing.
     Values beyond the limits are taken. Raises InputError for an unknown name, and as `joint_motion` does.
     """
+    if not isinstance(q, Mapping):
+        raise InputError(f"the configuration is {q!r}; give a dict of joints and their values")
     joints = bundle.tree_joints
     called = {name: bundle.tree_joint(name) for name in q}
     if unknown := [str(name) for name, joint in called.items() if joint is None]:

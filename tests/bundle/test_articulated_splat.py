@@ -132,6 +132,11 @@ def test_backgrounds_are_colours_or_images(solid, camera):
     for wrong in (1.0, [1, 1], np.ones((7, 7, 3)), "white"):
         with pytest.raises(InputError, match="the background is no colour"):
             picture.over(wrong)
+    for wrong, found in (([math.nan] * 3, "nan"), ([255] * 3, "255"), (np.full((40, 48, 3), -100.0), "-100")):
+        with pytest.raises(InputError, match=f"the background has a number of {found}; give colours of 0 to 1"):
+            picture.over(wrong)
+    with pytest.raises(InputError, match="the background is no colour"):
+        picture.over(torch.ones(3).to_sparse())
 
 
 def test_a_device_that_is_not_there_is_refused(bundle):
@@ -189,12 +194,30 @@ def test_pictures_have_gradients_by_joint_values(solid, camera):
         ({"hinge": [0.1, 0.2], "slide": [0.1, 0.2, 0.3]}, r"different batches: hinge \[2\], slide \[3\]"),
         ({"hinge": "wide"}, "'wide' are no numbers"),
         ({"hinge": math.inf}, "not finite"),
+        ({"hinge": 1e300}, r"has a value of 1e\+300"),
+        ({"slide": [0.1, -1e18]}, r"has a value of 1e\+18"),
+        (None, "the configuration is None; give a dict"),
+        ([0.1], r"the configuration is \[0.1\]; give a dict"),
     ],
 )
 def test_configurations_that_cannot_be_are_refused(solid, camera, q, found):
     for ask in (solid.link_poses, lambda q: solid.render(camera, q)):
         with pytest.raises(InputError, match=found):
             ask(q)
+
+
+def test_what_is_nearly_beyond_all_use_gives_a_picture(solid, camera):
+    far = camera.T_world_camera.clone()
+    far[:3, 3] = 9e17
+    assert not solid.render(Camera(far, camera.K, *SIZE)).alpha.any()
+    assert solid.render(camera, {"hinge": 9e17, "slide": 9e17}).rgb.isfinite().all()
+
+
+def test_other_things_than_cameras_and_folders_are_refused(solid, camera):
+    with pytest.raises(InputError, match="the camera is None; give a Camera"):
+        solid.render(None)
+    with pytest.raises(InputError, match="the bundle's folder is None; give its path"):
+        load(None)
 
 
 def test_batches_that_do_not_go_together_are_refused(solid, cameras):

@@ -93,6 +93,7 @@ def test_any_number_of_intrinsics_is_a_batch(count):
         (np.eye(3), (50, 50, 20, 16), 40, r"T_world_camera has the shape \[3, 3\]"),
         (2 * EYE, (50, 50, 20, 16), 40, "no rigid motion"),
         (np.diag([1.0, 1, -1, 1]), (50, 50, 20, 16), 40, "no rigid motion"),
+        (EYE + 1e200 * np.eye(4, k=3), (50, 50, 20, 16), 40, r"T_world_camera has a number of 1e\+200; give lengths"),
         (EYE * np.nan, (50, 50, 20, 16), 40, "not finite"),
         (EYE, (-50, 50, 20, 16), 40, "fx and fy above 0"),
         (EYE, [[50, 1, 20], [0, 50, 16], [0, 0, 1]], 40, "no pinhole"),
