@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from splatart_ns import cli
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.procedural import build_object
 from splatart_ns.capture.synthesis_options import SynthesisOptions
@@ -99,6 +100,26 @@ def test_pictures_that_find_no_room_are_named_and_gone(run_main, hinge_fit, tmp_
         code, _, errors = run_main("render", hinge_fit, "--output", tmp_path / "a.gif", *SMALL)
     assert code == 2 and f"{tmp_path / 'a.gif'}: cannot be read or written (File too large)" in errors
     assert list(tmp_path.iterdir()) == []
+
+
+def _raise(*errors):
+    """Raise the first for the second, which is raised for the third, ..."""
+    try:
+        if errors[1:]:
+            _raise(*errors[1:])
+    except BaseException as error:
+        raise errors[0] from error
+    raise errors[0]
+
+
+def test_ctrl_c_is_an_interruption_whatever_numba_makes_of_it(run_main, monkeypatch):
+    for errors in ((KeyboardInterrupt(),), (SystemError("dispatcher"), SystemError("unpickle"), KeyboardInterrupt())):
+        monkeypatch.setattr(cli, "_run", lambda errors=errors: _raise(*errors))
+        code, output, said = run_main("fit")
+        assert (code, output) == (130, "") and said.startswith("Interrupted.") and said.count("\n") == 1
+    monkeypatch.setattr(cli, "_run", lambda: _raise(SystemError("bad call"), ValueError()))
+    with pytest.raises(SystemError, match="bad call"):
+        run_main("fit")
 
 
 def test_check_tells_all_problems(run_main, hinge_capture, tmp_path):

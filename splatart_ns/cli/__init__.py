@@ -51,7 +51,9 @@ def main() -> None:
         else:
             raise
         raise SystemExit(2) from None
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        if not _is_interrupt(error):
+            raise
         print("Interrupted. An unfinished fit or batch goes on when it is started again.", file=sys.stderr)
         raise SystemExit(130) from None
 
@@ -63,6 +65,13 @@ def _run() -> None:
         sys.stdout.flush()
         raise
     sys.stdout.flush()
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether it is Ctrl-C, or what numba makes of it while a kernel returns: SystemErrors on top."""
+    while isinstance(error, SystemError):
+        error = error.__cause__ or error.__context__
+    return isinstance(error, KeyboardInterrupt)
 
 
 def _print_no_more() -> None:
