@@ -13,13 +13,19 @@ import torch
 from PIL import Image
 
 from splatart_ns.bundle import load, orbit_camera
+from splatart_ns.errors import InputError
 from splatart_ns.splats.palette import part_colours
 
 STEPS, SIZE = 5, 256
 
+if len(sys.argv) != 3:
+    sys.exit("usage: python examples/open_and_look.py BUNDLE PICTURES, the folder of a bundle and one for pictures")
 bundle, folder = map(Path, sys.argv[1:])
+try:
+    obj = load(bundle)
+except InputError as error:
+    sys.exit(str(error))
 folder.mkdir(parents=True, exist_ok=True)
-obj = load(bundle)
 if not obj.joints:
     sys.exit(f"{bundle} has no joint that moves.")
 name, joint = next(iter(obj.joints.items()))
