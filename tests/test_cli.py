@@ -296,6 +296,14 @@ def test_synth_renders_a_robot_and_its_own_objects(start_splatart, run_main, tmp
         assert (tmp_path / name / "ground_truth.json").is_file()
 
 
+def test_a_folder_of_an_objects_name_does_not_hide_it(run_main, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "hinge").mkdir()
+    options = ("--train-views", 3, "--test-views", 1, "--resolution", 16)
+    code, output, errors = run_main("synth", "hinge", "--output-dir", "x", *options)
+    assert (code, errors) == (0, "") and output.endswith("Capture: x\n")
+
+
 @pytest.fixture
 def restore_rasterizer():
     """After the test, what this process rasterizes with is as before."""

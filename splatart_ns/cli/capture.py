@@ -29,7 +29,7 @@ class Synth:
         from splatart_ns.capture.procedural import is_object_name, synthesize_object
         from splatart_ns.capture.synthesis import synthesize
 
-        if is_object_name(str(self.robot)) and not self.robot.exists():
+        if is_object_name(str(self.robot)) and not self.robot.is_file():  # a folder may have its name
             synthesize_object(str(self.robot), self.output_dir, self.options)
         else:
             synthesize(self.robot, self.output_dir, self.options)
