@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any
 
-from splatart_ns.batch.storage import Folder, Storage, join, open_storage
+from splatart_ns.batch.storage import Folder, Storage, join, open_storage, require_folder
 from splatart_ns.errors import InputError
 
 _TRANSFORMS = "transforms.json"
@@ -45,13 +45,16 @@ def read_entries(source: str, settings: dict[str, Any]) -> list[Entry]:
     `root`, `seed` and `joints` (in a CSV with `;` between them); what a row does not say is as in `settings`.
 
     Raises:
-        InputError: no capture, or a manifest that cannot be used; it names the line.
+        InputError: no capture, no such folder, or a manifest that cannot be used; it names the line.
     """
     manifest = source.lower().endswith((".csv", ".jsonl"))
+    mend = "give a folder above captures, or a .csv or .jsonl that names them"
+    if not manifest:
+        require_folder(source, mend)
     entries = _read_manifest(source, settings) if manifest else _find(open_storage(source), settings)
     if not entries:
         found = "there is no capture in it (links to folders are not followed)"
-        raise InputError(f"{source}: {found}; give a folder above captures, or a .csv or .jsonl that names them.")
+        raise InputError(f"{source}: {found}; {mend}.")
     _check_names(source, entries)
     return entries
 

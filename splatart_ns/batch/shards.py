@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.stage import Needs, Stage, Work, stage_key
-from splatart_ns.batch.storage import Storage, join, open_storage
+from splatart_ns.batch.storage import Storage, join, open_storage, require_folder
 from splatart_ns.capture.synthesis_options import MOST_PIXELS
 from splatart_ns.errors import InputError
 
@@ -54,8 +54,10 @@ def find_bundles(source: str) -> list[str]:
     """Folders of bundles at or below a folder or URL, relative to it, in order.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, or no such folder.
     """
+    mend = "give the --output-dir of `splatart batch`"
+    require_folder(source, mend)
     storage, found, paths = open_storage(source), [], [""]
     while paths:
         path = paths.pop()
@@ -66,7 +68,7 @@ def find_bundles(source: str) -> list[str]:
         inner = (name for name in sorted(folders, reverse=True) if not name.startswith("."))
         paths += [join(path, name) for name in inner]
     if not found:
-        raise InputError(f"{source}: there is no bundle in it; give the --output-dir of `splatart batch`.")
+        raise InputError(f"{source}: there is no bundle in it (links to folders are not followed); {mend}.")
     return found
 
 

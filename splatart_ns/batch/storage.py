@@ -84,6 +84,14 @@ def patiently(ask: Callable[[], T]) -> T:
     return ask()
 
 
+def require_folder(source: str, mend: str) -> None:
+    """Raise InputError for a folder of this machine that is not there; what is not in an object store only is empty."""
+    storage = open_storage(source)
+    if isinstance(storage, Folder) and not os.path.isdir(storage.url):
+        found = "is no folder" if os.path.lexists(storage.url) else "there is no such folder"
+        raise InputError(f"{source}: {found}; {mend}.")
+
+
 def join(path: str, name: str) -> str:
     """A path below another, which may be "", the storage itself."""
     return f"{path}/{name}" if path else name

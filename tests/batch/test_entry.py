@@ -65,12 +65,14 @@ def test_links_to_captures_are_not_followed_but_can_be_named(make, tmp_path):
     assert names(tmp_path / "list.csv") == ["a"]
 
 
-@pytest.mark.parametrize("content", [None, "notes/readme.txt"])
-def test_no_capture_at_all_is_a_mistake(make, tmp_path, content):
-    if content is not None:
-        make(content)
+def test_no_capture_at_all_is_a_mistake(make, tmp_path):
+    with pytest.raises(InputError, match="notes: there is no such folder; give a folder above captures"):
+        names(tmp_path / "notes")
+    make("notes/readme.txt")
     with pytest.raises(InputError, match="no capture"):
         names(tmp_path / "notes")
+    with pytest.raises(InputError, match="readme.txt: is no folder; give a folder above captures"):
+        names(tmp_path / "notes/readme.txt")
 
 
 @pytest.mark.parametrize("out", ["captures", "captures/a", "captures/a/state_00/new", "link"])

@@ -178,7 +178,7 @@ def test_what_depends_on_a_setting_or_a_state_has_another_key():
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["nowhere"], "no capture"),
+        (["nowhere"], "no such folder"),
         (["list.csv"], "cannot be read"),
         (["nowhere", "--seed", "-1"], "--seed is -1"),
         (["nothing://bucket"], "nothing://bucket"),

@@ -57,8 +57,13 @@ def members(path):
 
 def test_bundles_are_found_in_order(bundles, tmp_path):
     assert find_bundles(str(bundles)) == ["a", "c", "deep/b"]
-    with pytest.raises(InputError, match="no bundle"):
-        find_bundles(str(tmp_path))
+    (tmp_path / "links").mkdir()
+    (tmp_path / "links/a").symlink_to(bundles / "a")
+    with pytest.raises(InputError, match=r"no bundle in it \(links to folders are not followed\)"):
+        find_bundles(str(tmp_path / "links"))
+    assert find_bundles(str(tmp_path / "links/a")) == [""]
+    with pytest.raises(InputError, match="gone: there is no such folder; give the --output-dir"):
+        find_bundles(str(tmp_path / "gone"))
 
 
 def test_every_image_is_in_one_shard_and_bundles_take_turns(bundles):
