@@ -259,8 +259,7 @@ def _thumbnails(bundle: Any) -> list[str]:
         sphere = camera.bounding_sphere(bundle, path)
     except InputError:  # nothing can be seen
         return []
-    azimuth = camera.front_azimuth(bundle) + math.radians(40)
-    view = camera.orbit_camera(*sphere, azimuth, math.radians(25), _THUMBNAIL, _THUMBNAIL)
+    view = camera.orbit_camera(*sphere, camera.front_azimuth(bundle), camera.ELEVATION, _THUMBNAIL, _THUMBNAIL)
     pictures = []
     for frame in animation.render_frames(ArticulatedSplat(bundle), path, view):
         data = io.BytesIO()

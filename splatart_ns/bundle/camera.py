@@ -21,7 +21,10 @@ from splatart_ns.records import LONGEST
 
 _SAMPLES_PER_PART = 500
 _MIN_OPACITY = 0.1
-_FIELD_OF_VIEW = math.radians(35)
+FIELD_OF_VIEW = math.radians(35)
+ELEVATION = math.radians(25)
+"""Above the xy plane, from where an object is looked at if nothing else is asked for."""
+_BESIDE = math.radians(40)
 _MOST_PIXELS = 1e9
 """Focal lengths and centres reach no further."""
 
@@ -126,13 +129,14 @@ def bounding_sphere(bundle: Bundle, configurations: Sequence[Mapping[str, JointV
 
 
 def front_azimuth(bundle: Bundle) -> float:
-    """The direction in the xy plane, radian from +x to +y, from the root part to the others: where doors are seen."""
+    """The direction in the xy plane, radian from +x to +y, from which an object is looked at if nothing else is asked
+    for: beside that from the root part to the others, where doors are seen."""
     centres = {part.name: part.splat.means.double().mean(0) for part in bundle.parts if len(part.splat)}
     root = centres.pop(bundle.root, None)
     if root is None or not centres:
-        return 0.0
+        return _BESIDE
     x, y, _ = (torch.stack(list(centres.values())).mean(0) - root).tolist()
-    return math.atan2(y, x)
+    return math.atan2(y, x) + _BESIDE
 
 
 def orbit_camera(
@@ -144,7 +148,7 @@ def orbit_camera(
     """
     if not 0 < radius < math.inf:
         raise InputError(f"the radius is {radius}; give a number above 0")
-    half = _FIELD_OF_VIEW / 2
+    half = FIELD_OF_VIEW / 2
     focal = min(width, height) / 2 / math.tan(half)
     back = np.array(
         [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]

@@ -146,7 +146,7 @@ class Render:
             view = cameras.capture_camera(load_capture(self.data), self.camera)
         else:
             degrees = self.azimuth
-            azimuth = cameras.front_azimuth(bundle) + math.radians(40) if degrees is None else math.radians(degrees)
+            azimuth = cameras.front_azimuth(bundle) if degrees is None else math.radians(degrees)
             sphere, elevation = cameras.bounding_sphere(bundle, path), math.radians(self.elevation)
             view = cameras.orbit_camera(*sphere, azimuth, elevation, self.resolution, self.resolution)
         images = animation.render_frames(splat, path, view, self.channel, self.background)

@@ -20,7 +20,7 @@ from PIL import Image
 from torch import Tensor
 
 from splatart_ns.bundle.articulated_splat import ArticulatedSplat
-from splatart_ns.bundle.camera import front_azimuth, orbit_camera
+from splatart_ns.bundle.camera import ELEVATION, FIELD_OF_VIEW, front_azimuth, orbit_camera
 from splatart_ns.bundle.configurations import Configuration, sweep
 from splatart_ns.errors import InputError
 from splatart_ns.viewer.axis import Axes
@@ -39,11 +39,8 @@ _FRAMES = 60
 _FRAME_SECONDS = 1 / 20
 _IDLE_SECONDS = 1.0
 _MAX_ASPECT = 4.0
-_FIELD_OF_VIEW = math.radians(35)
 _BACKDROP = 100.0
 """Radius, in radii of the object."""
-_AZIMUTH, _ELEVATION = math.radians(40), math.radians(25)
-"""Where a browser starts: beside the object's front, and above it."""
 
 
 class Viewer:
@@ -116,9 +113,9 @@ class Viewer:
         panel.save_picture.on_click(lambda event: jobs.put(lambda: self._save_picture(event.client)))
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        start = orbit_camera(np.zeros(3), 1.0, front_azimuth(self._bundle) + _AZIMUTH, _ELEVATION, 1, 1)
+        start = orbit_camera(np.zeros(3), 1.0, front_azimuth(self._bundle), ELEVATION, 1, 1)
         with client.atomic():
-            client.camera.fov = _FIELD_OF_VIEW
+            client.camera.fov = FIELD_OF_VIEW
             client.camera.position = start.T_world_camera[:3, 3].numpy()
             client.camera.look_at = np.zeros(3)
         client.camera.on_update(lambda _: self._changed())

@@ -22,7 +22,7 @@ import numpy as np
 
 from splatart_ns.bundle.animation import bundle_colours
 from splatart_ns.bundle.bundle import Bundle, Joint, Part
-from splatart_ns.bundle.camera import bounding_sphere, front_azimuth
+from splatart_ns.bundle.camera import ELEVATION, FIELD_OF_VIEW, bounding_sphere, front_azimuth
 from splatart_ns.bundle.configurations import movable_joints
 from splatart_ns.bundle.export.quantization import quantized
 from splatart_ns.bundle.joint_axis import (
@@ -42,7 +42,6 @@ _SCRIPTS = (
 """In the order in which they need each other; the last starts the page."""
 _SMALLEST = math.log(1e-4)
 """Logarithm of the least standard deviation in radii of the object: less is a point on any screen."""
-_AZIMUTH, _ELEVATION, _FIELD_OF_VIEW = math.radians(40), math.radians(25), math.radians(35)
 _SECTIONS = 12
 """Of a drawn axis."""
 
@@ -88,9 +87,9 @@ def page_object(bundle: Bundle) -> dict[str, Any]:
         "view": {
             "centre": centre.tolist(),
             "radius": radius,
-            "azimuth": front_azimuth(bundle) + _AZIMUTH,
-            "elevation": _ELEVATION,
-            "field_of_view": _FIELD_OF_VIEW,
+            "azimuth": front_azimuth(bundle),
+            "elevation": ELEVATION,
+            "field_of_view": FIELD_OF_VIEW,
         },
     }
 
