@@ -70,9 +70,10 @@ def test_the_mesh_is_scored_at_both_ends(truth, bundle):
         assert all(0 < at[key] < 1000 * 2 * 0.3**2 for key in ("CD-s", "CD-m", "CD-w"))
     bundle.parts[2].motion = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     wrong = chamfer_mesh(truth, bundle)
-    assert wrong["parts"] == values["parts"]
+    # Where the latch is tells what it hides of the others.
+    assert wrong["parts"] == pytest.approx(values["parts"], rel=0.05)
     assert wrong["last"]["parts"]["latch"] > values["last"]["parts"]["latch"] + 1
-    assert wrong["last"]["CD-s"] == values["last"]["CD-s"]
+    assert wrong["last"]["CD-s"] == pytest.approx(values["last"]["CD-s"], rel=0.05)
 
 
 def test_a_part_that_nobody_sees_has_no_mesh(truth, bundle):
