@@ -120,7 +120,7 @@ def test_samples_of_a_shard_are_not_all_in_memory_at_once(bundles, tmp_path, mon
     options = replace(OPTIONS, images=30, shard_size=30, resolution=8)
     (tmp_path / "bundle").mkdir()
     (entry,) = Shards(str(bundles), ["a", "c"], options)
-    Sharding(options, "torch").run("images", Work(entry, open_storage(str(tmp_path / "out")), tmp_path / "bundle"))
+    Sharding(options, "auto").run("images", Work(entry, open_storage(str(tmp_path / "out")), tmp_path / "bundle"))
     assert list(members(tmp_path / "bundle/images.tar"))[::4] == [f"{image:09d}.rgb.png" for image in range(30)]
     assert Counted.most <= 8  # files of two samples
 
