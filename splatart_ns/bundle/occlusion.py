@@ -49,6 +49,7 @@ class Extent:
 
     @property
     def diameter(self) -> float:
+        """The length of the box's diagonal; its axes are the last directions."""
         return float((self.reach[-6:-3] + self.reach[-3:]).norm())
 
 

@@ -31,6 +31,7 @@ from splatart_ns.stages.joint import EPSILON, NOISE, fit_joint
 from splatart_ns.stages.joint_constraint import JointConstraint, required_parents
 from splatart_ns.stages.joint_fit import JointFit, free_joint
 from splatart_ns.stages.joint_pairs import descend_pairs, fit_pairs, stood_still, surface_error, told_pair
+from splatart_ns.stages.tree_reasons import exchange_hint, fits_far_worse, why_contradicted, why_unattached
 from splatart_ns.stages.tree_refinement import refine_tree
 from splatart_ns.stages.unseen import known_states, leads_blindly, may_have_turned, place_unseen
 from splatart_ns.stages.unseen_turn import turned_unseen
@@ -145,10 +146,9 @@ def infer_tree(
     contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups}, known)
     tree = build_tree(sorted(points), joints | groups, contacts, root, radius, required, names)
     reached = reached_from([(j.parent, j.child) for j in tree.joints if (j.parent, j.child) not in groups], root)
-    reasons = {base: _why_unattached(base, reached, joints, radius, names) for _, base in groups}
+    reasons = {base: why_unattached(base, reached, joints, radius, names) for _, base in groups}
     reasons = tree.unattached | reasons
-    exchanged = {p: _exchanged(p, points, motions) for p in reasons}
-    reasons = {p: why + _exchange_hint(p, exchanged[p], names) for p, why in reasons.items()}
+    reasons = {p: why + exchange_hint(p, points, motions, names) for p, why in reasons.items()}
     tree = replace(tree, unattached=reasons, contradicted=contradicted)
     if method == "descent":  # its fits have no scores
         return replace(tree, joints=[replace(j, other=None) for j in tree.joints])
@@ -190,8 +190,8 @@ def _as_told(
         excluded = {d.type for d in constraints if d.forbidden and {d.parent, d.child} == set(pair)}
         told = told_pair(c, joints, pair, motions, radius, excluded, **certainty)
         if not c.forbidden:
-            if c.type is not None and _fits_far_worse(told[edge], joints[edge]):
-                contradicted[c.child] = _why_contradicted(edge, told[edge], joints[edge], radius, names)
+            if c.type is not None and fits_far_worse(told[edge], joints[edge]):
+                contradicted[c.child] = why_contradicted(edge, told[edge], joints[edge], radius, names)
             told = {edge: replace(fit, accepted=True) for edge, fit in told.items()}
         joints = {edge: fit for edge, fit in joints.items() if set(edge) != set(pair)} | told
     return joints, contradicted
@@ -280,7 +280,7 @@ def build_tree(
     rest.sort(key=lambda j: j.cost)
     loops = [j for j in rest if _closes_loop(tree, j, contacts[_pair(j.parent, j.child)], object_radius)]
     rejected = [j for j in rest if j not in loops]
-    unattached = {p: _why_unattached(p, reached, joints, object_radius, names) for p in part_ids if p not in reached}
+    unattached = {p: why_unattached(p, reached, joints, object_radius, names) for p in part_ids if p not in reached}
     return replace(tree, loops=loops, rejected=rejected, unattached=unattached)
 
 
@@ -413,58 +413,3 @@ def _path(tree: KinematicTree, part: int) -> set[int]:
 
 def _numbered(part_ids: Iterable[int]) -> dict[int, str]:
     return {p: f"part {p}" for p in part_ids}
-
-
-def _why_unattached(
-    part: int,
-    reached: set[int],
-    joints: Mapping[tuple[int, int], JointFit],
-    object_radius: float,
-    names: Mapping[int, str],
-) -> str:
-    # Either way round, as the parts' points differ; what one leaves may be within the limit.
-    tried = [
-        (max(fit.residual, joints.get((c, p), fit).residual) / object_radius, p, fit.type)
-        for (p, c), fit in joints.items()
-        if c == part and p in reached
-    ]
-    if not tried:
-        return f"No joint was fitted between {names[part]} and any part of the tree."
-    residual, parent, kind = min(tried)
-    return (
-        f"No joint explains how {names[part]} moves: the best, {kind} on {names[parent]}, leaves {residual:.1%} of the "
-        "object's radius, more than the limit and than noise would."
-    )
-
-
-def _fits_far_worse(told: JointFit, free: JointFit) -> bool:
-    """Whether a joint of the type that the user told is none that would be accepted, but one of another type is."""
-    return not told.accepted and free.accepted and free.type != told.type
-
-
-def _why_contradicted(
-    edge: tuple[int, int], told: JointFit, free: JointFit, object_radius: float, names: Mapping[int, str]
-) -> str:
-    parent, child = (names[p] for p in edge)
-    return (
-        f"--joint '{child}:{parent}={told.type}' leaves {told.residual / object_radius:.1%} of the object's radius "
-        f"unexplained; {free.type} would leave {free.residual / object_radius:.1%}."
-    )
-
-
-def _exchanged(part: int, points: Mapping[int, Tensor], motions: Mapping[int, Tensor]) -> int | None:
-    """A part that in some state lies nearer to where `part` was in the first one than to where it was itself, as
-    `part` does to it."""
-    centres = {p: x.double().mean(0) for p, x in points.items()}
-    places = {p: transform_points(motions[p].double(), centre[None])[:, 0] for p, centre in centres.items()}
-
-    def nearer(a: int, b: int) -> Tensor:
-        return (places[a] - centres[b]).norm(dim=-1) < (places[a] - centres[a]).norm(dim=-1)
-
-    return next((p for p in points if p != part and bool((nearer(part, p) & nearer(p, part)).any())), None)
-
-
-def _exchange_hint(part: int, other: int | None, names: Mapping[int, str]) -> str:
-    if other is None:
-        return ""
-    return f" In some state it lies where {names[other]} was, and {names[other]} where it was: are their ids exchanged?"
