@@ -29,11 +29,9 @@ _THUMBNAIL = 96
 """Rows and columns of a picture in the report."""
 
 
-_TRAINED_ON = ("device", "rasterizer")
-"""What the report says of the machine that trained; the one that finds the joints may have no GPU."""
 _CHECK = {"digest": str, "worlds": str, "downscale": int, "states": [{"name": str, "digest": str, "pixels": int}]}
 _TRAINING = {"seconds": NUMBER, "notes": [str]}
-_POSE = _TRAINING | dict.fromkeys(_TRAINED_ON, str)
+_POSE = _TRAINING | {"device": str, "rasterizer": str}
 _EXPORT = {"failed_checks": [str], "notes": [str]}
 _JOINT = {"name": str, "type": str, "parent": str, "child": str, "residual": NUMBER, "ambiguous": bool}
 _SUMMARY = {
@@ -148,7 +146,7 @@ def _check(work: Work, settings: Settings) -> dict[str, Any]:
 def _train(work: Work, stage: str, settings: Settings) -> tuple[dict[str, Any], list[str]]:
     """A stage of the fit, from the runs that earlier ones have left."""
     from splatart_ns.capture.formats import load_capture
-    from splatart_ns.plugin.fit import report_head, stage_configs
+    from splatart_ns.plugin.fit import TRAINED_ON, report_head, stage_configs
     from splatart_ns.plugin.stage_run import run_stage
 
     with work.capture() as path:
@@ -159,7 +157,7 @@ def _train(work: Work, stage: str, settings: Settings) -> tuple[dict[str, Any], 
             work.fetch(_run_folder(configs[name], work.folder))
         outcome = run_stage(configs[stage], lambda steps: None)
         if stage == "pose":
-            outcome |= {key: report_head(capture, settings)[key] for key in _TRAINED_ON}
+            outcome |= {key: report_head(capture, settings)[key] for key in TRAINED_ON}
         # The run shall open where it will lie.
         at_home = stage_configs(capture, work.home, settings)[stage]
         run = configs[stage].get_base_dir()
@@ -168,7 +166,7 @@ def _train(work: Work, stage: str, settings: Settings) -> tuple[dict[str, Any], 
         if stage == "joint":
             done = {name: work.outcome(name) for name in configs if name != stage} | {stage: outcome}
             told = report_head(capture, settings) | {"capture": work.entry.capture, **_stages_of_report(done)}
-            told |= {key: done["pose"][key] for key in _TRAINED_ON}
+            told |= {key: done["pose"][key] for key in TRAINED_ON}
             write_json(work.folder / "report.json", told)
             kept += ["report.json", "parts", "articulation.json"]
     return outcome, kept

@@ -71,8 +71,8 @@ MOST_WARNINGS = 3
 
 
 _REPORT = {"stages": [{"name": str, "seconds": NUMBER}], "settings": dict, "versions": dict}
-_TRAINED_ON = ("device", "rasterizer")
-"""What the report says of the machine that trained; the one that finds the joints may be another."""
+TRAINED_ON = ("device", "rasterizer")
+"""What the report says of the machine that trained; the one that finds the joints may be another, without a GPU."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Report:
     def __init__(self, path: Path, capture: Capture, settings: Settings):
         self.path = path
         self.data = report_head(capture, settings) | {"stages": [], "seconds": 0.0}
-        self._here = {key: self.data[key] for key in _TRAINED_ON}
+        self._here = {key: self.data[key] for key in TRAINED_ON}
         self._earlier = self._read_stages() if path.exists() else []
         self._last = time.perf_counter()
 
@@ -139,7 +139,7 @@ class Report:
             stages = [stage for stage in stages if stage["name"] != "joint"]
         version_had, version_here = (of["versions"].get("splatart-ns") for of in (earlier, self.data))
         if same and version_had == version_here:
-            self.data |= {key: earlier[key] for key in _TRAINED_ON if key in earlier}
+            self.data |= {key: earlier[key] for key in TRAINED_ON if key in earlier}
             return stages
         other = f"by splatart-ns {version_had}" if same else "of another capture or with other settings"
         CONSOLE.print(f"{self.path.parent} holds a fit {other}; starting over.", markup=False)
