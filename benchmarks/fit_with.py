@@ -60,7 +60,7 @@ def main(options: Options) -> None:
         with few_imports():
             from splatart_ns.plugin import fit as fitting
 
-        apply(options.set, options.quality, fitting)
+        apply(options.set, options.quality)
         imported = time.perf_counter()
         how = {"seed": options.seed, "rasterizer": options.rasterizer, "companions": companions}
         fitting.fit(options.capture, options.output_dir, options.quality, **how)
@@ -75,20 +75,23 @@ def main(options: Options) -> None:
             evaluate.evaluate(options.output_dir, options.truth or options.capture)
 
 
-def apply(settings: tuple[str, ...], quality: str, fitting: Any) -> None:
+def apply(settings: tuple[str, ...], quality: str) -> None:
     """Change what the stages of this process are configured with.
 
     Raises:
         SystemExit: A setting that is not there, or a value of another type.
     """
-    stages = {stage: getattr(fitting, f"{stage}_method").config for stage in ("semantic", "pose", "joint")}
+    from splatart_ns.plugin import settings as efforts
+    from splatart_ns.plugin import stage_configs
+
+    stages = {stage: getattr(stage_configs, f"{stage}_method").config for stage in ("semantic", "pose", "joint")}
     for setting in settings:
         path, _, text = setting.partition("=")
         first, *names = path.split(".")
         if first == "effort":
-            effort = fitting.EFFORTS[quality]
+            effort = efforts.EFFORTS[quality]
             value = parse(text, getattr(effort, names[0], None), setting)
-            fitting.EFFORTS[quality] = dataclasses.replace(effort, **{names[0]: value})
+            efforts.EFFORTS[quality] = dataclasses.replace(effort, **{names[0]: value})
             continue
         owner = stages.get(first)
         for name in names[:-1]:

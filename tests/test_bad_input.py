@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import pytest
 
-from splatart_ns.plugin.fit import Settings, require_fittable
+from splatart_ns.plugin.settings import Settings, require_fittable
 
 TRANSFORMS = "state_00/transforms.json"
 

@@ -3,7 +3,6 @@
 import importlib.metadata
 import json
 import shutil
-from typing import get_args
 
 import imageio
 import numpy as np
@@ -50,13 +49,6 @@ def assert_shows_an_object(frame):
 def test_the_console_script_is_this_command():
     (script,) = importlib.metadata.entry_points(group="console_scripts", name="splatart")
     assert script.value == "splatart_ns.cli:main"
-
-
-def test_every_format_can_be_asked_for():
-    from splatart_ns.bundle.export import Format
-    from splatart_ns.cli import common
-
-    assert get_args(common.Format) == get_args(Format)
 
 
 def test_help_names_every_command(start_splatart):

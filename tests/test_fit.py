@@ -201,7 +201,8 @@ def test_the_users_word_on_a_joint_holds(fit_copy, hinge_capture, run_main):
 @pytest.mark.parametrize(("pixels", "times"), [((256, 300), 2), ((1000, 800), 2), ((255, 300), 1)])
 def test_a_draft_looks_at_smaller_images_where_enough_of_them_is_left(hinge_capture, tmp_path, pixels, times):
     from splatart_ns.capture.formats import load_capture
-    from splatart_ns.plugin.fit import Settings, stage_configs
+    from splatart_ns.plugin.settings import Settings
+    from splatart_ns.plugin.stage_configs import stage_configs
 
     capture = load_capture(hinge_capture)
     sizes = iter([pixels])
@@ -238,7 +239,8 @@ class TestResuming:
     @pytest.fixture
     def report(self):
         from splatart_ns.capture.formats import load_capture
-        from splatart_ns.plugin.fit import Report, Settings
+        from splatart_ns.plugin.report import Report
+        from splatart_ns.plugin.settings import Settings
 
         def make(bundle, capture, quality="draft", root=None, seed=0, rasterizer="auto", joints=()):
             settings = Settings(quality, root, seed, rasterizer, list(joints))

@@ -15,25 +15,27 @@ BELOW = {
     "plain_yaml": set(),
     "shape": set(),
     "threads": set(),
+    "choices": {"errors"},
     "files": {"errors"},
     "records": {"errors", "shape"},
     "geometry": {"errors"},
     "splats": {"errors", "files", "geometry"},
-    "rasterize": {"errors", "geometry", "splats", "threads"},
-    "capture": {"errors", "files", "geometry", "machine", "plain_yaml", "shape"},
+    "rasterize": {"choices", "errors", "geometry", "splats", "threads"},
+    "capture": {"choices", "errors", "files", "geometry", "machine", "plain_yaml", "shape"},
     "stages": {"capture", "errors", "geometry", "rasterize", "splats", "threads"},
 }
-BELOW["bundle"] = BELOW["stages"] | {"files", "records", "stages"}
+BELOW["bundle"] = BELOW["stages"] | {"choices", "files", "records", "stages"}
 BELOW["evaluation"] = BELOW["bundle"] | {"bundle"}
 BELOW["viewer"] = BELOW["bundle"] | {"bundle"}
 BELOW["plugin"] = BELOW["bundle"] | {"bundle", "machine", "plain_yaml", "shape"}
 BELOW["batch"] = BELOW["plugin"] | {"plugin"}
 BELOW["method_configs"] = {"plugin"}
-BELOW["cli"] = {"batch", "bundle", "capture", "errors", "evaluation", "machine", "plugin", "rasterize", "viewer"}
+BELOW["cli"] = {"batch", "bundle", "capture", "choices", "errors", "evaluation", "machine", "plugin", "rasterize"}
+BELOW["cli"] |= {"viewer"}
 """What each part of the package may import of the others."""
 
-ABOVE_THE_METHODS = {"splatart_ns/plugin/fit.py": {"method_configs"}}
-"""`splatart fit` runs the methods that are made of its neighbours."""
+ABOVE_THE_METHODS = {"splatart_ns/plugin/stage_configs.py": {"method_configs"}}
+"""A fit runs the methods that are made of the plugin."""
 
 FILES = sorted([*(ROOT / "splatart_ns").rglob("*.py"), *(ROOT / "method_configs").rglob("*.py")])
 

@@ -16,7 +16,7 @@ from splatart_ns.batch.progress import LiveProgress
 from splatart_ns.batch.shards import Sharding, ShardOptions, Shards, check_no_others, find_bundles
 from splatart_ns.batch.stage import Recipe
 from splatart_ns.batch.storage import open_storage
-from splatart_ns.errors import InputError
+from splatart_ns.choices import require_seed
 
 ALL_DONE, SOME_FAILED, ALL_FAILED = 0, 3, 4
 """Exit codes."""
@@ -33,8 +33,7 @@ def fit_captures(
     console: Console,
 ) -> int:
     """Fit all captures of a source, see `read_entries`; returns the exit code."""
-    if not 0 <= settings["seed"] < 2**32:
-        raise InputError(f"--seed is {settings['seed']}; give 0 to {2**32 - 1}.")
+    require_seed(settings["seed"])
     recipe = Fitting(rasterizer, tuple(dict.fromkeys(exports)))
     entries = read_entries(source, settings)
     check_apart(entries, open_storage(out_url))

@@ -10,9 +10,10 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import PurePath
-from typing import Any
+from typing import Any, get_args
 
 from splatart_ns.batch.storage import Folder, Storage, join, open_storage, require_folder
+from splatart_ns.choices import Quality, require_seed
 from splatart_ns.errors import InputError
 
 _TRANSFORMS = "transforms.json"
@@ -22,7 +23,6 @@ _MARKS = (
 )
 """Files of captures in other layouts, see `capture.peer_layouts`."""
 _SETTINGS = ("quality", "root", "seed", "joints")
-_QUALITIES = ("draft", "standard", "high")
 _LONGEST_NAME, _DEEPEST = 150, 100
 
 
@@ -166,11 +166,9 @@ def _entry(where: str, row: dict[str, Any], folder: str, settings: dict[str, Any
             raise InputError(f"{where}: '{key}' is {row[key]!r}; give a text.")
     if "path" not in row:
         raise InputError(f"{where}: 'path' is missing; give the folder of a capture.")
-    if row.get("quality", "draft") not in _QUALITIES:
-        raise InputError(f"{where}: 'quality' is {row['quality']!r}; give one of {', '.join(_QUALITIES)}.")
-    seed = row.get("seed", 0)
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
-        raise InputError(f"{where}: 'seed' is {seed!r}; give 0 to {2**32 - 1}.")
+    if row.get("quality", "draft") not in get_args(Quality):
+        raise InputError(f"{where}: 'quality' is {row['quality']!r}; give one of {', '.join(get_args(Quality))}.")
+    require_seed(row.get("seed", 0), f"{where}: 'seed'")
     joints = row.get("joints", [])
     if not isinstance(joints, list) or not all(isinstance(joint, str) for joint in joints):
         raise InputError(f"{where}: 'joints' is {joints!r}; give a list of texts.")

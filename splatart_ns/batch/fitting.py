@@ -19,7 +19,7 @@ from splatart_ns.shape import NUMBER
 
 # What a stage needs is imported when it runs: the process that only hands out stages starts at once and stays small.
 if TYPE_CHECKING:
-    from splatart_ns.plugin.fit import Settings
+    from splatart_ns.plugin.settings import Settings
 
 _BASE_MB = 1100
 """Memory of a process that has loaded the libraries, and of the Gaussians."""
@@ -114,7 +114,7 @@ class Fitting:
         from splatart_ns.plugin.imports import few_imports
 
         with few_imports():
-            from splatart_ns.plugin.fit import Settings
+            from splatart_ns.plugin.settings import Settings
 
         given = work.entry.settings
         return Settings(given["quality"], given["root"], given["seed"], self.rasterizer, list(given["joints"]))
@@ -123,7 +123,7 @@ class Fitting:
 def _check(work: Work, settings: Settings) -> dict[str, Any]:
     """Whether the capture can be fitted, what it is, and how much of it there is to hold in memory."""
     from splatart_ns.capture.digest import capture_digest
-    from splatart_ns.plugin.fit import image_downscale, require_fittable
+    from splatart_ns.plugin.settings import image_downscale, require_fittable
 
     with work.capture() as path:
         capture = require_fittable(path, settings)
@@ -146,7 +146,8 @@ def _check(work: Work, settings: Settings) -> dict[str, Any]:
 def _train(work: Work, stage: str, settings: Settings) -> tuple[dict[str, Any], list[str]]:
     """A stage of the fit, from the runs that earlier ones have left."""
     from splatart_ns.capture.formats import load_capture
-    from splatart_ns.plugin.fit import TRAINED_ON, report_head, stage_configs
+    from splatart_ns.plugin.report import TRAINED_ON, report_head
+    from splatart_ns.plugin.stage_configs import stage_configs
     from splatart_ns.plugin.stage_run import run_stage
 
     with work.capture() as path:

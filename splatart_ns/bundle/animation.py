@@ -6,7 +6,6 @@ from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import imageio_ffmpeg
@@ -19,11 +18,11 @@ from splatart_ns.bundle.articulated_splat import ArticulatedSplat, Picture
 from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.camera import Camera, bounding_sphere
 from splatart_ns.bundle.configurations import Configuration
+from splatart_ns.choices import Channel
 from splatart_ns.errors import InputError
 from splatart_ns.files import replacing
 from splatart_ns.splats.palette import part_colours
 
-Output = Literal["rgb", "depth", "accumulation", "parts"]
 _FILMS = {".gif", ".mp4"}
 """How the names of films end that can be written."""
 _OTHER_FORMATS = {".png", ".apng", ".jpg", ".jpeg", ".webp", ".avif", ".bmp", ".tif", ".tiff", ".exr", ".svg", ".pdf"}
@@ -35,7 +34,7 @@ def render_frames(
     splat: ArticulatedSplat,
     configurations: Sequence[Configuration],
     camera: Camera,
-    output: Output = "rgb",
+    output: Channel = "rgb",
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> Iterator[np.ndarray]:
     """Render one frame per configuration, uint8 [H, W, 3] RGB.
@@ -54,7 +53,7 @@ def render_frames(
 
 
 def _image(
-    picture: Picture, output: Output, colours: Tensor, background: Tensor, depths: tuple[float, float]
+    picture: Picture, output: Channel, colours: Tensor, background: Tensor, depths: tuple[float, float]
 ) -> Tensor:
     """What is shown [H, W, 3] in 0..1."""
     alpha = picture.alpha.cpu()

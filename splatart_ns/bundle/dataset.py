@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from splatart_ns.bundle.articulated_splat import ArticulatedSplat, Picture
 from splatart_ns.bundle.camera import Camera, bounding_sphere, orbit_camera
 from splatart_ns.bundle.configurations import Configuration
 from splatart_ns.capture.synthesis_options import MOST_PIXELS
+from splatart_ns.choices import Views
 from splatart_ns.errors import InputError
 
 _PLASTIC = 1.32471795724474602596
@@ -21,8 +22,6 @@ _PLASTIC = 1.32471795724474602596
 Unreasonable Effectiveness of Quasirandom Sequences, 2018)."""
 _MOST_STATES, _SIZED_BY = 100_000, 256
 """Configurations that there may be; so many of them say how large the object is."""
-
-Views = Literal["sphere", "hemisphere"]
 
 
 @dataclass(frozen=True)

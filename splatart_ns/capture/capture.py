@@ -6,14 +6,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
+from splatart_ns.choices import Worlds
 from splatart_ns.errors import InputError, printable
 
-Worlds = Literal["shared", "rigid", "similar"]
-"""How the states' worlds differ: not at all, by a rigid motion (a device measured lengths), or by one with a scale."""
 UNLABELLED = 255
 """The label of a pixel that nobody labelled."""
 REACH = 1.5

@@ -19,7 +19,6 @@ from splatart_ns.capture.capture import (
     Problem,
     Report,
     State,
-    Worlds,
 )
 from splatart_ns.capture.images import image_size
 from splatart_ns.capture.part_names import read_part_names
@@ -35,6 +34,7 @@ from splatart_ns.capture.values import (
     relative_path,
     show,
 )
+from splatart_ns.choices import Worlds
 
 TRANSFORMS = "transforms.json"
 SPLITS = ("train", "val", "test")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 from splatart_ns.capture.light import Light
+from splatart_ns.choices import Views
 
 MOST_PIXELS = 16384
 """Along a side of an image that is made."""
@@ -28,7 +28,7 @@ class SynthesisOptions:
     """Training views per state."""
     test_views: int = 8
     """Test views per state, and of the novel configuration."""
-    views: Literal["sphere", "hemisphere"] = "sphere"
+    views: Views = "sphere"
     """See the object from everywhere, or from above only."""
     resolution: int = 256
     """Pixels along each side of an image."""

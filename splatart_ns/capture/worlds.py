@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatart_ns.capture.capture import REACH, Capture, State, Worlds
+from splatart_ns.capture.capture import REACH, Capture, State
+from splatart_ns.choices import Worlds
 from splatart_ns.errors import InputError
 
 APART, UNLIKE = 1.0, 3.0

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
-from splatart_ns.cli.common import CONSOLE, Format, Quality, Rasterizer
+from splatart_ns.choices import Format, Quality, Rasterizer, Views
+from splatart_ns.cli.common import CONSOLE
 
 
 @dataclass
@@ -65,7 +66,7 @@ class Shards:
     """Configurations of each bundle."""
     resolution: int = 256
     """Pixels along each side."""
-    views: Literal["sphere", "hemisphere"] = "sphere"
+    views: Views = "sphere"
     """See the objects from everywhere, or from above only."""
     seed: int = 0
     """Seed of views and configurations."""

@@ -9,7 +9,8 @@ from typing import Annotated, get_args
 
 import tyro
 
-from splatart_ns.cli.common import CONSOLE, Format, Rasterizer, choose_rasterizer, device
+from splatart_ns.choices import Format, Rasterizer
+from splatart_ns.cli.common import CONSOLE, choose_rasterizer, device
 from splatart_ns.errors import InputError
 
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import os
-from typing import Literal
 
 from rich.console import Console
+
+from splatart_ns.choices import Rasterizer
 
 CONSOLE = Console(markup=False)  # paths and names may have brackets
 if not CONSOLE.is_terminal and "COLUMNS" not in os.environ:
     CONSOLE.width = 160  # files and pipes have no edge at which tables and sentences must break
-Format = Literal["urdf", "mjcf", "usd", "glb", "ply", "html"]
-Quality = Literal["draft", "standard", "high"]
-Rasterizer = Literal["auto", "torch", "numba", "gsplat"]
 
 
 def choose_rasterizer(rasterizer: Rasterizer) -> None:

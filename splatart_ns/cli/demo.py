@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Literal
 
 from splatart_ns.capture.synthesis_options import OBJECTS, SynthesisOptions
+from splatart_ns.choices import Quality
 from splatart_ns.cli.bundle import Evaluate
-from splatart_ns.cli.common import CONSOLE, Quality
+from splatart_ns.cli.common import CONSOLE
 from splatart_ns.cli.fit import Fit
 from splatart_ns.cli.render import Render
 

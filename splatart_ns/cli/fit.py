@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
-from splatart_ns.cli.common import Quality, Rasterizer, choose_rasterizer
+from splatart_ns.choices import Quality, Rasterizer, RefineCameras, Worlds
+from splatart_ns.cli.common import choose_rasterizer
 
 
 @dataclass
@@ -29,11 +30,11 @@ class Fit:
     joint: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """What you know of a joint, by the parts' names: child:parent, child:parent=revolute (or another type),
     child:parent=none (there is none) or child:parent=not-revolute."""
-    worlds: Literal["shared", "rigid", "similar"] | None = None
+    worlds: Worlds | None = None
     """For states that were captured separately: rigid where the device measured lengths, similar where structure from
     motion gave each its own scale. The states are brought into the world of the first by the part --root, or one that
     is chosen. By default what the capture says."""
-    refine_cameras: Literal["auto", "on", "off"] = "auto"
+    refine_cameras: RefineCameras = "auto"
     """Whether to correct the cameras' poses; auto does where the silhouettes contradict each other."""
     rasterizer: Rasterizer = "auto"
     """auto takes gsplat on CUDA, else numba where it is installed, else torch."""

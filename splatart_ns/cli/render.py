@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.progress import track
 
 from splatart_ns.capture.synthesis_options import MOST_PIXELS
-from splatart_ns.cli.common import CONSOLE, Rasterizer, choose_rasterizer
+from splatart_ns.choices import Channel, Rasterizer, Views
+from splatart_ns.cli.common import CONSOLE, choose_rasterizer
 from splatart_ns.errors import InputError
 
 if TYPE_CHECKING:  # it brings torch
@@ -40,11 +41,11 @@ class Render:
     Run it again to go on, or with more to add some."""
     states: int = 2
     """Configurations of the dataset, each within the joints' ranges; the images are dealt out to them."""
-    views: Literal["sphere", "hemisphere"] = "sphere"
+    views: Views = "sphere"
     """See the object of the dataset from everywhere, or from above only."""
     seed: int = 0
     """Seed of the dataset."""
-    channel: Literal["rgb", "depth", "accumulation", "parts"] = "rgb"
+    channel: Channel = "rgb"
     """What to show."""
     frames: int = 60
     """Frames of each joint's sweep."""

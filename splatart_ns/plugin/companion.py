@@ -16,6 +16,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any, BinaryIO
 
+from splatart_ns.choices import Rasterizer
 from splatart_ns.machine import CALM_THREADS, num_cores
 
 os.environ.update({**CALM_THREADS, **os.environ})  # of both ends
@@ -27,7 +28,6 @@ from splatart_ns.plugin.imports import few_imports
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
-    from splatart_ns.rasterize.rasterization import Backend
 
 Outcome = dict[str, Any]
 """What a run took: seconds, iterations, gaussians, peak_memory_mb; its notes for the user; and what else it found."""
@@ -46,7 +46,9 @@ class Companion:
             start_new_session=True,  # Ctrl-C is for this process, which ends the others
         )
 
-    def train(self, config: TrainerConfig, backend: Backend, threads: int, on_step: Callable[[int], None]) -> Outcome:
+    def train(
+        self, config: TrainerConfig, backend: Rasterizer, threads: int, on_step: Callable[[int], None]
+    ) -> Outcome:
         """`run_stage` over there.
 
         Raises:
@@ -119,7 +121,7 @@ def _serve(source: BinaryIO, tell: Callable[[str, Any], None]) -> None:
         from splatart_ns.rasterize.rasterization import set_backend
         from splatart_ns.threads import kernel_threads
 
-    runs: queue.SimpleQueue[tuple[TrainerConfig, Backend, int]] = queue.SimpleQueue()
+    runs: queue.SimpleQueue[tuple[TrainerConfig, Rasterizer, int]] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(source, runs), daemon=True).start()
     CONSOLE.quiet = True
     told = 0.0

@@ -11,11 +11,12 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
-from splatart_ns.capture.capture import Capture, Worlds
+from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.check import require_valid
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.images import undistorted_camera
 from splatart_ns.capture.worlds import focus_on_focus
+from splatart_ns.choices import Worlds
 from splatart_ns.errors import InputError
 
 

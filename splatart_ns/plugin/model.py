@@ -11,11 +11,12 @@ from nerfstudio.models.base_model import Model
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from torch import Tensor, nn
 
+from splatart_ns.choices import Rasterizer
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.camera import viewmat_from_opengl
 from splatart_ns.plugin.compat import StartView
 from splatart_ns.plugin.gaussians import gauss_params_from_splat, random_splat, splat_from_points
-from splatart_ns.rasterize.rasterization import Backend, set_backend
+from splatart_ns.rasterize.rasterization import set_backend
 from splatart_ns.rasterize.render import Rendering, render
 from splatart_ns.rasterize.ssim import ssim
 from splatart_ns.splats.palette import part_colours
@@ -38,7 +39,7 @@ class SplatartModelConfig(SplatfactoModelConfig):
     """Degree of the spherical harmonics; higher ones pay where surfaces shine."""
     lpips: bool = False
     """Whether evaluation computes LPIPS, whose weights are downloaded on first use."""
-    rasterizer: Backend = "auto"
+    rasterizer: Rasterizer = "auto"
     """For the whole process; auto: what was chosen before, else gsplat on CUDA, numba where installed, torch."""
 
 

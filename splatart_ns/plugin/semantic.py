@@ -18,6 +18,7 @@ from splatart_ns.capture.digest import training_digest
 from splatart_ns.capture.seen_surface import LEAST_CONFIRMED
 from splatart_ns.capture.view import View
 from splatart_ns.capture.worlds import OTHER_WORLDS_MEND, looks_elsewhere
+from splatart_ns.choices import RefineCameras
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
@@ -45,7 +46,6 @@ from splatart_ns.stages.semantic import (
 )
 from splatart_ns.stages.spread import TOLD, spread
 
-RefineCameras = Literal["auto", "on", "off"]
 HALF_SIZE = 0.4
 """The share of the first phase that sees images of half the size."""
 LEAST_PIXELS = 256

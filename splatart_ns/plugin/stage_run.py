@@ -17,11 +17,12 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
+from splatart_ns.choices import Rasterizer
 from splatart_ns.errors import DISK_ERRORS, InputError
 from splatart_ns.machine import num_cores
 from splatart_ns.plugin.companion import Companion, Companions, Outcome
 from splatart_ns.plugin.compat import seed_everything, stop_event_writers
-from splatart_ns.rasterize.rasterization import Backend, default_device
+from splatart_ns.rasterize.rasterization import default_device
 from splatart_ns.threads import kernel_threads
 
 
@@ -77,7 +78,7 @@ def num_processes(runs: int) -> int:
 def run_side_by_side(
     configs: Sequence[TrainerConfig],
     processes: int,
-    backend: Backend,
+    backend: Rasterizer,
     on_step: Callable[[int, int], None],
     companions: Companions,
 ) -> Iterator[Outcome]:

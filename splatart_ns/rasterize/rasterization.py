@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
 
+from splatart_ns.choices import Rasterizer
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.spherical_harmonics import sh_basis
 from splatart_ns.rasterize import torch_backend
@@ -22,21 +23,18 @@ from splatart_ns.rasterize.arguments import (
 )
 from splatart_ns.rasterize.projection import project
 
-Backend = Literal["auto", "torch", "numba", "gsplat"]
+_chosen: Rasterizer = "auto"
 
 
-_chosen: Backend = "auto"
-
-
-def set_backend(backend: Backend) -> None:
+def set_backend(backend: Rasterizer) -> None:
     """Choose what "auto" stands for in this process; "auto" is this machine's best again.
 
     Raises:
         InputError: The backend cannot run here.
     """
     global _chosen
-    if backend not in get_args(Backend):
-        raise InputError(f"There is no rasterizer {backend!r}: take one of {', '.join(get_args(Backend))}.")
+    if backend not in get_args(Rasterizer):
+        raise InputError(f"There is no rasterizer {backend!r}: take one of {', '.join(get_args(Rasterizer))}.")
     if backend == "numba" and not has_numba():
         raise InputError("The numba rasterizer needs numba: pip install 'splatart-ns[cpu]', or take the torch one.")
     if backend == "gsplat" and not torch.cuda.is_available():
@@ -49,7 +47,7 @@ def default_device() -> str:
     return "cuda" if torch.cuda.is_available() and _runs_on(_chosen, "cuda") else "cpu"
 
 
-def default_backend(device_type: str | None = None) -> Backend:
+def default_backend(device_type: str | None = None) -> Rasterizer:
     """The backend that "auto" stands for on a type of device ("cpu", "cuda", ...), by default `default_device`: the
     chosen one if it runs there, else the best."""
     device_type = device_type or default_device()
@@ -60,7 +58,7 @@ def default_backend(device_type: str | None = None) -> Backend:
     return "numba" if device_type == "cpu" and has_numba() else "torch"
 
 
-def _runs_on(backend: Backend, device_type: str) -> bool:
+def _runs_on(backend: Rasterizer, device_type: str) -> bool:
     return {"numba": "cpu", "gsplat": "cuda"}.get(backend, device_type) == device_type
 
 
@@ -96,7 +94,7 @@ def rasterization(
     distributed: bool = False,
     camera_model: str = "pinhole",
     covars: Tensor | None = None,
-    backend: Backend = "auto",
+    backend: Rasterizer = "auto",
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole images. Arguments are those of gsplat 1.4.0, plus `backend`.
 
@@ -223,7 +221,7 @@ def rasterize_neighbours(
     width: int,
     height: int,
     eps2d: float = 0.3,
-    backend: Backend = "auto",
+    backend: Rasterizer = "auto",
 ) -> Tensor:
     """Images of a camera and of others so near it that they may differ from its image to first order alone.
 
@@ -257,7 +255,7 @@ def rasterize_neighbours(
     return numba_backend.rasterize_neighbours(means2d, conics, opacities, colors, depths, radii > 0, width, height)
 
 
-def sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int, backend: Backend = "auto") -> Tensor:
+def sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int, backend: Rasterizer = "auto") -> Tensor:
     """Colours [C, N, 3] seen from the cameras `viewmats` [C, 4, 4] of Gaussians with coefficients `sh`.
 
     `sh` is [N, K, 3] or [C, N, K, 3], K >= (degree + 1)^2. `backend` as in `rasterization`.
@@ -267,7 +265,7 @@ def sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int, backend:
     return _sh_colors(means, sh, viewmats, degree, _resolve(backend, means))
 
 
-def _sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int, backend: Backend) -> Tensor:
+def _sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int, backend: Rasterizer) -> Tensor:
     if backend == "numba":
         from splatart_ns.rasterize import numba_spherical_harmonics
 
@@ -284,12 +282,12 @@ def _sh_colors(means: Tensor, sh: Tensor, viewmats: Tensor, degree: int, backend
     return ((terms @ channels.repeat(K, 1))[..., :3] + 0.5).clamp_min(0)
 
 
-def _resolve(backend: Backend, means: Tensor) -> Backend:
+def _resolve(backend: Rasterizer, means: Tensor) -> Rasterizer:
     """The backend to use for Gaussians at `means`."""
     if backend == "auto":
         return default_backend(means.device.type) if means.dtype == torch.float32 else "torch"
-    if backend not in get_args(Backend):
-        raise ValueError(f"unknown rasterization backend {backend!r}: use {', '.join(get_args(Backend))}")
+    if backend not in get_args(Rasterizer):
+        raise ValueError(f"unknown rasterization backend {backend!r}: use {', '.join(get_args(Rasterizer))}")
     if backend == "numba" and (means.dtype, means.device.type) != (torch.float32, "cpu"):
         raise ValueError(f"the numba backend takes float32 on the CPU, not {means.dtype} on {means.device}: use torch")
     return backend
@@ -301,7 +299,7 @@ def _gaussians(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, 
     return arguments
 
 
-def _steps(backend: Backend):
+def _steps(backend: Rasterizer):
     """The functions that project and composite."""
     if backend == "numba":
         from splatart_ns.rasterize import numba_backend, numba_projection

@@ -8,7 +8,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from splatart_ns.rasterize.rasterization import Backend, rasterization, sh_colors
+from splatart_ns.choices import Rasterizer
+from splatart_ns.rasterize.rasterization import rasterization, sh_colors
 from splatart_ns.splats.splat import Splat
 
 PIXEL_VARIANCE = 1 / 12
@@ -44,7 +45,7 @@ def render(
     sh_degree: int | None = None,
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
-    backend: Backend = "auto",
+    backend: Rasterizer = "auto",
 ) -> Rendering:
     """Render `splat` into C pinhole cameras.
 

@@ -131,7 +131,7 @@ def stages(settings, told, **recipe):
 
 def test_smaller_images_of_one_state_train_the_others_anew(hinge_capture, tmp_path, monkeypatch):
     """Where they are too small to be looked at half as large, as those of all states are."""
-    monkeypatch.setattr("splatart_ns.plugin.fit.SMALLEST", 30)
+    monkeypatch.setattr("splatart_ns.plugin.settings.SMALLEST", 30)
     shutil.copytree(hinge_capture, tmp_path / "capture")
     entry = Entry("hinge", str(tmp_path / "capture"), SETTINGS)
 

@@ -12,9 +12,10 @@ from hypothesis import given
 
 from splatart_ns.errors import InputError
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_config, run_setting
-from splatart_ns.plugin.fit import Report, Settings
 from splatart_ns.plugin.gaussians import SPLAT_SHAPES, splat_from_state
+from splatart_ns.plugin.report import Report
 from splatart_ns.plugin.semantic_run import find_semantic_runs
+from splatart_ns.plugin.settings import Settings
 
 CONFIG = """!!python/object:splatart_ns.plugin.joint.JointTrainerConfig
 max_num_iterations: 10
@@ -132,7 +133,7 @@ REPORT = {
 def test_any_report_of_an_interrupted_fit(tmp_path, monkeypatch, data):
     """It goes on from there, or starts over, or says that the file is none."""
     head = {key: value for key, value in REPORT.items() if key not in ("stages", "seconds")}
-    monkeypatch.setattr("splatart_ns.plugin.fit.report_head", lambda *_: head)
+    monkeypatch.setattr("splatart_ns.plugin.report.report_head", lambda *_: head)
     file = tmp_path / "report.json"
     file.write_bytes(data)
     report = one_sentence(Report, file, SimpleNamespace(), Settings("draft", None, 0))

@@ -15,7 +15,10 @@ from splatart_ns.capture.formats import load_capture
 from splatart_ns.errors import InputError
 from splatart_ns.plugin import stage_run
 from splatart_ns.plugin.companion import Companions
-from splatart_ns.plugin.fit import Report, Settings, _semantic_config, _train
+from splatart_ns.plugin.fit import _train
+from splatart_ns.plugin.report import Report
+from splatart_ns.plugin.settings import Settings
+from splatart_ns.plugin.stage_configs import _semantic_config
 from splatart_ns.plugin.stage_run import num_processes, run_side_by_side, run_stage
 
 

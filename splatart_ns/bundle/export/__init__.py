@@ -2,10 +2,11 @@
 
 from splatart_ns.bundle.export.describe import DENSITY, LIMIT_MARGIN, check_numbers, describe
 from splatart_ns.bundle.export.folder import check_folder
-from splatart_ns.bundle.export.formats import WITHOUT_MESHES, Format, export, format_notes, require
+from splatart_ns.bundle.export.formats import WITHOUT_MESHES, export, format_notes, require
 from splatart_ns.bundle.export.robot import Robot
 from splatart_ns.bundle.export.shapes import PartShape, part_shapes
 from splatart_ns.bundle.export.validation import Check, format_checks, validate
+from splatart_ns.choices import Format
 
 __all__ = [
     "DENSITY",

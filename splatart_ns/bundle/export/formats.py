@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.export.folder import export_folder
@@ -16,9 +16,9 @@ from splatart_ns.bundle.export.ply import write_whole_ply
 from splatart_ns.bundle.export.robot import Robot
 from splatart_ns.bundle.export.urdf import write_urdf
 from splatart_ns.bundle.export.usd import write_usd
+from splatart_ns.choices import Format
 from splatart_ns.errors import InputError
 
-Format = Literal["urdf", "mjcf", "usd", "glb", "ply", "html"]
 WITHOUT_MESHES: frozenset[Format] = frozenset({"ply", "html"})
 """Formats of the Gaussians themselves."""
 

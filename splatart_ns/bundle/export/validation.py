@@ -26,13 +26,13 @@ from splatart_ns.bundle.export.consumers import (
     YourdfpyModel,
 )
 from splatart_ns.bundle.export.describe import expected_poses
-from splatart_ns.bundle.export.formats import Format
 from splatart_ns.bundle.export.glb import sweep
 from splatart_ns.bundle.export.page_model import PageModel
 from splatart_ns.bundle.export.robot import Robot
 from splatart_ns.bundle.export.simulation import simulate
 from splatart_ns.bundle.posing import configured_motions
 from splatart_ns.bundle.sliders import bundle_sliders, configuration
+from splatart_ns.choices import Format
 
 CONFIGURATIONS = 100
 POSE_ERROR = 1e-6
