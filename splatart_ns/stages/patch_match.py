@@ -32,6 +32,37 @@ _STARTS, _CHANGES = 6, 3
 
 
 @jit
+def _affine_unlikeness(bright, patch, column, row, cu, cv, ru, rv):
+    """1 - NCC of a patch with an image's pixels about (row, column), where (dx, dy) from the patch's centre lies at
+    row + ru dx + rv dy, column + cu dx + cv dy; 1 where too few pixels are seen in both."""
+    height, width = bright.shape
+    count, k = 0, 0
+    sa, sb, saa, sbb, sab = 0.0, 0.0, 0.0, 0.0, 0.0
+    for dy in range(-REACH, REACH + 1, SKIP):
+        for dx in range(-REACH, REACH + 1, SKIP):
+            here = patch[k]
+            k += 1
+            c, r = column + cu * dx + cv * dy, row + ru * dx + rv * dy
+            if here == HIDDEN or not (0 <= c < width - 1 and 0 <= r < height - 1):
+                continue
+            i, j = int(r), int(c)
+            b00, b01, b10, b11 = bright[i, j], bright[i, j + 1], bright[i + 1, j], bright[i + 1, j + 1]
+            if b00 != HIDDEN and b01 != HIDDEN and b10 != HIDDEN and b11 != HIDDEN:
+                fr, fc = r - i, c - j
+                there = (1 - fr) * ((1 - fc) * b00 + fc * b01) + fr * ((1 - fc) * b10 + fc * b11)
+                count += 1
+                sa += here
+                sb += there
+                saa += here * here
+                sbb += there * there
+                sab += here * there
+    if count < _LEAST_SHARE * PATCH:
+        return 1.0
+    saa, sbb, sab = saa - sa * sa / count, sbb - sb * sb / count, sab - sa * sb / count
+    return 1 - sab / math.sqrt((saa + _NOISE * count) * (sbb + _NOISE * count))
+
+
+@jit
 def _unlikeness(bright, view, ray0, ray1, depth, n0, n1, n2, K, others, R, t, patch, least):
     """1 - NCC of a patch, the mean over the `BEST` other views; 1 for a view that cannot tell.
 
@@ -67,32 +98,7 @@ def _unlikeness(bright, view, ray0, ray1, depth, n0, n1, n2, K, others, R, t, pa
         area = cu * rv - cv * ru
         if not (_LEAST_AREA < area < _MOST_AREA):
             continue
-        height, width = bright.shape[1], bright.shape[2]
-        count, k = 0, 0
-        sa, sb, saa, sbb, sab = 0.0, 0.0, 0.0, 0.0, 0.0
-        for dy in range(-REACH, REACH + 1, SKIP):
-            for dx in range(-REACH, REACH + 1, SKIP):
-                here = patch[k]
-                if here != HIDDEN:
-                    c, r = column + cu * dx + cv * dy, row + ru * dx + rv * dy
-                    if 0 <= c < width - 1 and 0 <= r < height - 1:
-                        i, j = int(r), int(c)
-                        b00, b01 = bright[other, i, j], bright[other, i, j + 1]
-                        b10, b11 = bright[other, i + 1, j], bright[other, i + 1, j + 1]
-                        if b00 != HIDDEN and b01 != HIDDEN and b10 != HIDDEN and b11 != HIDDEN:
-                            fr, fc = r - i, c - j
-                            there = (1 - fr) * ((1 - fc) * b00 + fc * b01) + fr * ((1 - fc) * b10 + fc * b11)
-                            count += 1
-                            sa += here
-                            sb += there
-                            saa += here * here
-                            sbb += there * there
-                            sab += here * there
-                k += 1
-        unlike = 1.0
-        if count >= _LEAST_SHARE * PATCH:
-            saa, sbb, sab = saa - sa * sa / count, sbb - sb * sb / count, sab - sa * sb / count
-            unlike = 1 - sab / math.sqrt((saa + _NOISE * count) * (sbb + _NOISE * count))
+        unlike = _affine_unlikeness(bright[other], patch, column, row, cu, cv, ru, rv)
         place = BEST
         while place > 0 and least[place - 1] > unlike:
             if place < BEST:
@@ -104,6 +110,18 @@ def _unlikeness(bright, view, ray0, ray1, depth, n0, n1, n2, K, others, R, t, pa
     for k in range(BEST):
         total += least[k]
     return total / BEST
+
+
+@jit
+def _read_patch(bright, y, x, patch):
+    """A patch's pixels about (y, x) of one image; `HIDDEN` beyond its edges."""
+    height, width = bright.shape
+    k = 0
+    for dy in range(-REACH, REACH + 1, SKIP):
+        for dx in range(-REACH, REACH + 1, SKIP):
+            r, c = y + dy, x + dx
+            patch[k] = bright[r, c] if 0 <= r < height and 0 <= c < width else HIDDEN
+            k += 1
 
 
 @jit
@@ -137,12 +155,7 @@ def match(begin, end, worker, bright, K, others, R, t, near, far, stride, passes
                     low, high = near[view, i, j], far[view, i, j]
                     if low >= high or y >= height or x >= width or bright[view, y, x] == HIDDEN:
                         continue
-                    k = 0
-                    for dy in range(-REACH, REACH + 1, SKIP):
-                        for dx in range(-REACH, REACH + 1, SKIP):
-                            r, c = y + dy, x + dx
-                            patch[k] = bright[view, r, c] if 0 <= r < height and 0 <= c < width else HIDDEN
-                            k += 1
+                    _read_patch(bright[view], y, x, patch)
                     ray0, ray1 = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
                     length = math.sqrt(ray0 * ray0 + ray1 * ray1 + 1)
                     z, lowest = depth[view, i, j], unlike[view, i, j]
@@ -161,8 +174,7 @@ def match(begin, end, worker, bright, K, others, R, t, near, far, stride, passes
                             facing = m0 * ray0 + m1 * ray1 + m2
                             if facing > -_OBLIQUE * length:
                                 continue
-                            there0 = ray0 + (q - j) * stride / fx
-                            there1 = ray1 + (p - i) * stride / fy
+                            there0, there1 = ray0 + (q - j) * stride / fx, ray1 + (p - i) * stride / fy
                             d = depth[view, p, q] * (m0 * there0 + m1 * there1 + m2) / facing
                         else:
                             size = 0.5 ** (step + trial - 3)
