@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -14,6 +13,20 @@ from torch import Tensor
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import from_rotation_translation, so3_log
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.motion_preference import (
+    ALIKE,
+    AS_WELL,
+    DOUBTFUL,
+    HALF_TURN,
+    OTHERWISE,
+    SIMILAR_TURN,
+    TURNED_OVER,
+    looks_alike,
+    prefer_less_turn,
+    prefer_slide,
+    prefer_turn,
+    prefer_upright,
+)
 from splatart_ns.stages.part_pair import IN_EVEN_LIGHT, PartPair, part_pair
 from splatart_ns.stages.refinement import Refinement, increment, refine, shifted
 from splatart_ns.stages.registration import MIN_POINTS, distinct, part_points, point_to_plane, register
@@ -36,8 +49,6 @@ FINE_PIXELS = 10000
 """Refining needs as many; coarse images would bias it."""
 SIMILAR = 2.5
 """Candidates that cost more than this many times the best are dropped before refining."""
-OTHERWISE = math.radians(60)
-"""A motion that turns a part by so much more or less than another, or about another axis, is quite another one."""
 OTHERS = 2
 """So many of these are kept beside the best."""
 SUSPECT = 4.0
@@ -51,26 +62,6 @@ ENOUGH = 0.2
 """If that state shows at least this share of the part's pixels."""
 SEARCH_STEPS = (0.6, 0.3, 0.15, 0.08)
 """Steps of that search: part radii, and radians."""
-SLIDE_TURN = 6.0
-"""Degrees by which a slide may seem to turn."""
-TURNED_OVER = math.radians(90)
-"""A motion that turns a part by more is doubted, and a slide that looks alike is preferred to it."""
-UPRIGHT = 1.05
-"""Where it fits as well as each state's own Gaussians do, and one that turns the part by less costs less than this many
-times as much, that is preferred."""
-HALF_TURN = math.radians(170)
-"""What turns by more makes half a turn; to one that does, one that makes less is preferred while in doubt."""
-PITCHED, UNPITCHED = 0.1, 0.03
-"""A motion that shifts a part by more than the first along its axis, in part radii, is no mere turn; one that shifts it
-by less than the second is."""
-SIMILAR_TURN = 1.5
-"""A mere turn is preferred to a motion that is none where it costs less than this many times as much."""
-ALIKE = 1.25
-"""Motions that cost less than this many times the chosen one render as well: plain square knobs turned by 90 degrees
-more measured 1.08 to 1.18, hexagonal ones 1.03 to 1.12, other parts that are seen well above 2."""
-DOUBTFUL = 2.0
-"""So many times in place of `ALIKE` where the chosen motion may turn the part over: doors were seen to cost 1.4 times
-as much as turned over, in few views or as they are lit."""
 STILL_RATIO = 1.2
 """A part whose images fit no motion worse than this many times the best motion did not move."""
 RESTS_RATIO = 1.05
@@ -125,24 +116,21 @@ def initial_motion(
         own_cost, identity_cost = fine.own_cost(), float(fine.cost(identity[None])[0])
         if identity_cost < STILL_RATIO * own_cost:  # no motion fits much better than a state's own Gaussians
             return InitialMotion(identity, found=True, still=True, cost=identity_cost, identity_ratio=1.0)
-    found = register(source, target, seed)
-    candidates = torch.from_numpy(found).to(identity)
+    registered = torch.from_numpy(register(source, target, seed)).to(identity)
     if coarse is None or fine is None:
-        return InitialMotion(candidates[0], found=True)
-    candidates = torch.cat([identity[None], candidates])
+        return InitialMotion(registered[0], found=True)
     tiny = part_pair(splats, views, part, GLANCE_VIEWS, TINY_PIXELS)
-    glance = appearance_cost(tiny, candidates)
-    hopeful = candidates[torch.from_numpy(glance <= HOPELESS * glance.min())]
+    proposed = torch.cat([identity[None], registered])
+    glance = appearance_cost(tiny, proposed)
+    hopeful = proposed[torch.from_numpy(glance <= HOPELESS * glance.min())]
     closer = torch.from_numpy(point_to_plane(source, target, hopeful.numpy(force=True))).to(identity)
-    everything, candidates = torch.cat([candidates, closer]), torch.cat([hopeful, closer])
+    everything, candidates = torch.cat([proposed, closer]), torch.cat([hopeful, closer])
     chosen = choose(coarse, candidates, SIMILAR)
     if float(coarse.cost(identity[None])[0]) < STILL_RATIO * float(coarse.cost(chosen[:1])[0]):
         chosen = identity[None]
     ends = refined(coarse, fine, chosen)
     if min(e.cost for e in ends) > SUSPECT * own_cost:
-        small = part_pair(splats, views, part, 3, TINY_PIXELS)
-        wide = torch.stack([search(small, T) for T in choose(coarse, everything, float("inf"), keep=5)])
-        ends += [refine(fine, T, 10) for T in choose(coarse, wide, 1.5)]
+        ends += searched_widely(part_pair(splats, views, part, 3, TINY_PIXELS), coarse, fine, everything)
     T, cost, order = ranked(fine, ends)
     state = None
     if ends[order[0]].cost > SUSPECT * own_cost:
@@ -151,19 +139,15 @@ def initial_motion(
         coarse, fine = coarse.shown_by(state), fine.shown_by(state)
         identity_cost = float(fine.cost(identity[None])[0])
         T, cost, order = ranked(fine, ends)
-    known = torch.from_numpy(T[order]).to(identity)
     moved = identity_cost >= STILL_RATIO * ends[order[0]].cost
-    turned = turned_alike(tiny, coarse, known[0]) if moved else known[:0]
-    times = DOUBTFUL if so3_log(known[0, :3, :3]).norm() > TURNED_OVER else ALIKE
-    own = own_appearance(fine)
-    if len(turned) or moved and any(looks_alike(T, cost, order[0], i, own, times) for i in order):
+    doubtful = in_doubt(tiny, coarse, fine, T, cost, order, moved)
+    if len(doubtful):
         coarse, fine = (part_pair(splats, views, part, DOUBTFUL_VIEWS, n) for n in (COARSE_PIXELS, FINE_PIXELS))
         if state is not None:
             coarse, fine = coarse.shown_by(state), fine.shown_by(state)
         identity_cost = float(fine.cost(identity[None])[0])
-        ends = refined(coarse, fine, choose(coarse, torch.cat([known, turned, candidates]), SIMILAR))
+        ends = refined(coarse, fine, choose(coarse, torch.cat([doubtful, candidates]), SIMILAR))
         T, cost, order = ranked(fine, ends)
-        own = own_appearance(fine)
     best = ends[order[0]]
     identity_ratio = identity_cost / max(best.cost, 1e-12)
     still = identity_ratio < STILL_RATIO
@@ -172,6 +156,7 @@ def initial_motion(
         even = part_pair(splats, views, part, DOUBTFUL_VIEWS, FINE_PIXELS)
         stayed, turned = replace(even, **IN_EVEN_LIGHT).cost(torch.stack([identity, best.T])).tolist()
         still = stayed < STILL_RATIO * turned
+    own = own_appearance(fine)
     alike = () if still else tuple(ends[i].T for i in order if looks_alike(T, cost, order[0], i, own))
     return InitialMotion(
         identity if still else best.T,
@@ -182,6 +167,26 @@ def initial_motion(
         alike=alike,
         maybe_moved=maybe_moved,
     )
+
+
+def searched_widely(small: PartPair, coarse: PartPair, fine: PartPair, candidates: Tensor) -> list[Refinement]:
+    """What compass searches from the most hopeful of `candidates` [C, 4, 4], on few pixels, end in, refined."""
+    wide = torch.stack([search(small, T) for T in choose(coarse, candidates, float("inf"), keep=5)])
+    return [refine(fine, T, 10) for T in choose(coarse, wide, 1.5)]
+
+
+def in_doubt(
+    tiny: PartPair, coarse: PartPair, fine: PartPair, T: np.ndarray, cost: np.ndarray, order: list[int], moved: bool
+) -> Tensor:
+    """Motions [K, 4, 4] among which more views must choose: those of T [C, 4, 4], `ranked` by cost [C] and order, and
+    what `turned_alike` finds. None where the first of them, or that the part did not move, is beyond doubt."""
+    known = torch.from_numpy(T[order]).to(fine.centroid.device)
+    turned = turned_alike(tiny, coarse, known[0]) if moved else known[:0]
+    times = DOUBTFUL if so3_log(known[0, :3, :3]).norm() > TURNED_OVER else ALIKE
+    own = own_appearance(fine)
+    if len(turned) or moved and any(looks_alike(T, cost, order[0], i, own, times) for i in order):
+        return torch.cat([known, turned])
+    return known[:0]
 
 
 def explained_by_one_state(
@@ -244,7 +249,7 @@ def alike_in_even_light(
     near = [refine(even, start, 5) for start in choose(coarse, candidates, float("inf"))]
     least = min(end.cost for end in near)
     ends = [refine(evenly, end.T, 10) for end in near if end.cost <= SIMILAR_TURN * least]
-    limit = max(ALIKE * refine(evenly, T, 10).cost, STILL_RATIO * evenly.own_cost())
+    limit = max(ALIKE * refine(evenly, T, 10).cost, AS_WELL * evenly.own_cost())
     return [end.T for end in sorted(ends, key=lambda end: end.cost) if end.cost < limit]
 
 
@@ -282,19 +287,9 @@ def ranked(pair: PartPair, ends: Sequence[Refinement]) -> tuple[np.ndarray, np.n
     T = torch.stack([e.T for e in ends])
     cost, T = appearance_cost(pair, T), T.cpu().numpy()
     order = distinct(T, cost, pair.centroid.cpu().numpy(), pair.radius)
-    upright = cost[order[0]] < STILL_RATIO * own_appearance(pair) and prefer_upright(T, cost, order)
+    upright = cost[order[0]] < AS_WELL * own_appearance(pair) and prefer_upright(T, cost, order)
     order = upright or prefer_slide(T, cost, order)
     return T, cost, prefer_less_turn(T, cost, prefer_turn(T, cost, order, pair.radius))
-
-
-def looks_alike(
-    T: np.ndarray, cost: np.ndarray, chosen: int, other: int, own: float = 0.0, times: float = ALIKE
-) -> bool:
-    """Whether of motions [C, 4, 4] that cost [C] the `other` turns the part quite otherwise and costs less than so many
-    `times` as much, or fits as each state's `own` Gaussians do."""
-    turned = Rotation.from_matrix(T[chosen, :3, :3].T @ T[other, :3, :3]).magnitude()
-    # Half of what is quite another one: a hexagonal part looks alike after 60 degrees.
-    return bool(turned > OTHERWISE / 2 and cost[other] < max(times * cost[chosen], STILL_RATIO * own))
 
 
 def search(pair: PartPair, T: Tensor) -> Tensor:
@@ -312,74 +307,6 @@ def search(pair: PartPair, T: Tensor) -> Tensor:
                 break
             T, cost = trials[costs.argmin()], float(costs.min())
     return T
-
-
-def prefer_slide(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]:
-    """`order` of motions [C, 4, 4] by cost [C], with a slide first that fits nearly as well as a best one by which the
-    part turns over.
-
-    Where one state hides most of a part, no motion fits well: a drawer was seen to render a tenth better turned over.
-    """
-    turn = _angles(T)
-    slides = [i for i in order if turn[i] < math.radians(SLIDE_TURN) and cost[i] < ALIKE * cost[order[0]]]
-    if turn[order[0]] < TURNED_OVER or not slides:
-        return order
-    return [slides[0], *(i for i in order if i != slides[0])]
-
-
-def prefer_upright(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]:
-    """`order` of motions [C, 4, 4] by cost [C], with one first that turns the part less far than over and fits as well
-    as a best one by which it turns over; empty where there is none, or the best does not.
-
-    A knob looks alike turned over, but for its back, which no image shows.
-    """
-    turn = _angles(T)
-    upright = [i for i in order if turn[i] < TURNED_OVER and cost[i] < UPRIGHT * cost[order[0]]]
-    if turn[order[0]] < TURNED_OVER or not upright:
-        return []
-    return [upright[0], *(i for i in order if i != upright[0])]
-
-
-def prefer_turn(T: np.ndarray, cost: np.ndarray, order: list[int], radius: float) -> list[int]:
-    """`order` of motions [C, 4, 4] by cost [C], with one first that only turns and fits nearly as well as a best one
-    that also shifts the part along its axis.
-
-    A plain door fits nearly as well upside down, but only the right way round it turns about a hinge. Most parts that
-    turn hang on something that rests; that of others another motion merely turns is a rare accident.
-    """
-
-    def shift(i: int) -> float:
-        turn = Rotation.from_matrix(T[i, :3, :3]).as_rotvec()
-        angle = float(np.linalg.norm(turn))
-        return np.inf if np.degrees(angle) < SLIDE_TURN else abs(float(turn @ T[i, :3, 3])) / angle / radius
-
-    best = order[0]
-    if not PITCHED < shift(best) < np.inf:
-        return order
-    turns = [i for i in order if shift(i) < UNPITCHED and cost[i] < SIMILAR_TURN * cost[best]]
-    return [*turns[:1], *(i for i in order if i not in turns[:1])]
-
-
-def prefer_less_turn(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]:
-    """`order` of motions [C, 4, 4] by cost [C]: before half a turn comes less of one that differs by half a turn.
-
-    By whatever angle a plate turns about a hinge, once it is turned over, about a line across the hinge, it seems to
-    have made half a turn, about the line between where that one was and is. Parts that do make half a turn are rare.
-    Motions by which no hinge is told, and those that cost `DOUBTFUL` times as much, are not preferred.
-    """
-    first, turn = order[0], _angles(T)
-    if turn[first] < HALF_TURN:
-        return order
-    hinged = (
-        (math.pi - HALF_TURN < turn) & (turn < HALF_TURN) & (_angles(T[first, :3, :3].T @ T[:, :3, :3]) > HALF_TURN)
-    )
-    less = [i for i in order if hinged[i] and cost[i] < DOUBTFUL * cost[first]]
-    return [*less[:1], *(i for i in order if i not in less[:1])]
-
-
-def _angles(T: np.ndarray) -> np.ndarray:
-    """By how much motions [C, 4, 4] turn: radians [C]."""
-    return Rotation.from_matrix(T[:, :3, :3]).magnitude()
 
 
 def appearance_cost(pair: PartPair, T: Tensor) -> np.ndarray:
@@ -409,5 +336,5 @@ def choose(pair: PartPair, candidates: Tensor, similar: float, keep: int = 3, ow
     for i in order[keep:]:
         if len(chosen) < keep + OTHERS and (R[chosen] * R[i].inv()).magnitude().min() > OTHERWISE:
             chosen.append(i)
-    limit = max(similar * cost[order[0]], STILL_RATIO * own)
+    limit = max(similar * cost[order[0]], AS_WELL * own)
     return candidates[[i for i in chosen if cost[i] <= limit]]

@@ -16,19 +16,16 @@ from torch import Tensor
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import so3_log, transform_points
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.motion_preference import ALIKE, SLIDE_TURN, TURNED_OVER, looks_alike
 from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.refinement import shifted
 from splatart_ns.stages.render_choice import (
-    ALIKE,
     COARSE_PIXELS,
     DOUBTFUL_VIEWS,
     FINE_PIXELS,
-    SLIDE_TURN,
-    TURNED_OVER,
     VIEWS,
     InitialMotion,
     appearance_cost,
-    looks_alike,
 )
 
 REACH, STEP = 3.0, 0.1

@@ -7,12 +7,15 @@ from part_scene import angle_deg, box, motion, photograph, two_states
 
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import render_choice
+from splatart_ns.stages.motion_preference import (
+    ALIKE,
+    DOUBTFUL,
+    looks_alike,
+)
 from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.registration import part_points, register
 from splatart_ns.stages.render_choice import (
-    ALIKE,
     COARSE_PIXELS,
-    DOUBTFUL,
     FINE_PIXELS,
     SHADED_RATIO,
     STILL_RATIO,
@@ -20,13 +23,8 @@ from splatart_ns.stages.render_choice import (
     appearance_cost,
     choose,
     initial_motion,
-    looks_alike,
     mere_shifts,
     own_appearance,
-    prefer_less_turn,
-    prefer_slide,
-    prefer_turn,
-    prefer_upright,
     ranked,
     refined,
 )
@@ -82,23 +80,6 @@ def test_what_fits_as_each_states_own_gaussians_do_is_kept_and_looks_alike_howev
         assert len(choose(pair, motions, similar=1.5, own=own)) == 1 + kept
         assert looks_alike(motions.numpy(), cost, 0, 1, own) == kept
     assert not looks_alike(motions.numpy(), cost, 0, 0, cost[1])
-
-
-@pytest.mark.parametrize(
-    "turn_cost, rise, first",
-    [(1.2, 0.0, 1), (1.6, 0.0, 0), (1.2, 0.2, 0)],
-    ids=["a door upside down", "one that fits much worse", "neither merely turns"],
-)
-def test_a_mere_turn_is_preferred_to_a_turn_that_fits_hardly_better(turn_cost, rise, first):
-    """A door of a hinge about z; upside down it turns about its normal x, and is shifted along that."""
-    door, upside_down = motion((0, 0, 60), (0.3, 0.2, rise)), motion((180, 0, 0), (0.3, 0.2, 0.0))
-    T = torch.stack([upside_down, door]).numpy()
-    assert prefer_turn(T, np.array([1.0, turn_cost]), [0, 1], radius=0.5)[0] == first
-
-
-def test_a_mere_turn_that_fits_best_stays_first():
-    T = torch.stack([motion((0, 0, 60), (0.3, 0.2, 0.0)), motion((0, 0, 40), (0.1, 0.2, 0.0))]).numpy()
-    assert prefer_turn(T, np.array([1.0, 1.1]), [0, 1], radius=0.5) == [0, 1]
 
 
 def test_the_motion_of_a_part_is_found_from_splats_and_views(scene):
@@ -221,20 +202,6 @@ def test_a_few_gaussians_of_a_sliver_are_enough():
     assert ((found.T - T) @ centre)[:3].norm() < 0.01
 
 
-def test_a_slide_that_fits_nearly_as_well_is_preferred_to_turning_over():
-    T = np.stack([motion(turn, (0, 0, 0)).numpy() for turn in ((0, 178, 0), (0, 0, 60), (0, 0, 2))])
-    assert prefer_slide(T, np.array([1.0, 1.05, 0.98 * ALIKE]), [0, 1, 2]) == [2, 0, 1]
-    assert prefer_slide(T, np.array([1.0, 1.05, 1.3]), [0, 1, 2]) == [0, 1, 2]
-    assert prefer_slide(T, np.array([1.1, 1.0, 1.15]), [1, 0, 2]) == [1, 0, 2]
-
-
-def test_a_knob_that_fits_as_well_turned_by_less_is_not_turned_over():
-    T = np.stack([motion(turn, (0, 0, 0)).numpy() for turn in ((0, 133, 0), (0, 0, 48), (0, 0, 0))])
-    assert prefer_upright(T, np.array([1.0, 1.02, 1.03]), [0, 1, 2]) == [1, 0, 2]
-    assert prefer_upright(T, np.array([1.0, 1.2, 1.3]), [0, 1, 2]) == []
-    assert prefer_upright(T, np.array([1.0, 0.99, 1.3]), [1, 0, 2]) == []
-
-
 def test_where_the_right_turn_fits_no_slide_that_fits_worse_stands_for_turning_over():
     """A nearly symmetric knob: the images tell its turn, but hardly what lies behind it."""
     turn = motion((0, 0, 50), (0.0, 0.0, 0.0))
@@ -249,24 +216,6 @@ def test_where_the_right_turn_fits_no_slide_that_fits_worse_stands_for_turning_o
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(render_choice, "appearance_cost", lambda *_, costs=costs: np.array(next(costs)))
             assert ranked(pair, ends)[2][0] == first
-
-
-@pytest.mark.parametrize(
-    "turn, over, cost, preferred",
-    [
-        (47, (0, 0, 180), 1.5, True),
-        (47, (0, 0, 180), 2.5, False),
-        (3, (0, 0, 180), 1.5, False),
-        (90, (0, 85, 0), 1.5, False),
-        (47, (0, 60, 0), 0.9, True),
-    ],
-    ids=["a flap turned over", "it fits much worse", "no hinge", "a knob of four sides", "the better one is the less"],
-)
-def test_less_than_half_a_turn_is_preferred_to_the_part_turned_over(turn, over, cost, preferred):
-    less = motion((0, turn, 0), (0, 0, 0))
-    T = torch.stack([less @ motion(over, (0, 0, 0)), less]).numpy()
-    order = sorted((0, 1), key=lambda i: (1.0, cost)[i])
-    assert prefer_less_turn(T, np.array([1.0, cost]), order)[0] == int(preferred)
 
 
 OPENED = motion((60, 0, 0), (0.0, 0.1, 0.3))
