@@ -23,7 +23,7 @@ from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.folder import save_bundle
 from splatart_ns.bundle.sliders import freedoms, slider_range, unit_name
 from splatart_ns.bundle.vantage import vantage_points
-from splatart_ns.capture.capture import Normalization
+from splatart_ns.capture.capture import Capture, Normalization
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import se3_exp, se3_log
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint
@@ -214,54 +214,14 @@ class JointPipeline(StagePipeline):
         refuse_unread(self.model.config, "splatart-joint")
         capture = self.datamanager.capture
         normalization = capture.normalization
-        run = config.pose_run or find_pose_run(capture.path)
-        shape = (len(capture.states), len(capture.parts))
-        other = (
-            f"{run} is no finished splatart-pose run on a capture of {shape[0]} states and {shape[1]} parts; "
-            f"run `ns-train splatart-pose --data {capture.path}` again."
-        )
-        state = read_checkpoint(run, SPLAT_SHAPES | _pose_shapes(*shape), other)
-        if not state["_model.merged"]:
-            raise InputError(other)
+        state = _read_pose_run(config.pose_run or find_pose_run(capture.path), capture)
         splat = splat_from_state(state)
-        ids = splat.part_ids
-        world = splat_to_world(splat, normalization)
-        base = state["_model.poses.base"]
-        motions = torch.from_numpy(normalization.motion_to_world(base.numpy()))
+        motions = torch.from_numpy(normalization.motion_to_world(state["_model.poses.base"].numpy()))
         covariances = covariances_to_world(state["_model.covariance"], normalization)
         part_motions = {p: motions[:, p - 1] for p in capture.parts}
         part_covariances = {p: covariances[:, p - 1] for p in capture.parts}
         known = known_states(part_motions, part_covariances)
-        present = [p for p in capture.parts if bool((ids == p).any())]
-        # Joints are found about the object's place: the world's origin may be a thousand objects away, as a map's is.
-        here = replace(normalization, centre=np.zeros(3))
-        beside, motions_here = splat_to_world(splat, here), torch.from_numpy(here.motion_to_world(base.numpy()))
-        covariances_here = covariances_to_world(state["_model.covariance"], here)
-        points = {p: surface_points(beside.select(ids == p)) for p in present}
-        held = state["_model.held_ratio"]
-        ratios = {
-            (a, b): float(held[a - 1, b - 1])
-            for a in present
-            for b in present
-            if a != b and bool(torch.isfinite(held[a - 1, b - 1]))
-        }
-        root = next((p for p, name in capture.parts.items() if name == config.root), None)
-        if config.root is not None and not (root in present and known[root][0]):
-            raise InputError(
-                f"{capture.path} has no part '{config.root}' with Gaussians at state 0; choose another root."
-            )
-        self.tree = infer_tree(
-            points,
-            {p: motions_here[:, p - 1] for p in present},
-            covariances={p: covariances_here[:, p - 1] for p in present},
-            root=root,
-            render_ratios=ratios,
-            epsilon=config.epsilon,
-            method=config.method,
-            constraints=parse_constraints(config.joints, capture.parts, root),
-            names=capture.parts,
-        )
-        self.tree = doubted(shifted(self.tree, torch.from_numpy(normalization.centre)), state["_model.alike"])
+        self.tree = self._infer_tree(state, splat, known)
         self.notes = [f"{capture.parts[part]}: {reason}" for part, reason in self.tree.unattached.items()]
         self.notes += self.tree.contradicted.values()
         self.notes += [other_parent_note(j, capture.parts) for j in self.tree.joints if j.other is not None]
@@ -272,12 +232,11 @@ class JointPipeline(StagePipeline):
             motions = torch.stack([part_motions[p] for p in sorted(capture.parts)], dim=1)
             shift = torch.stack([torch.stack([torch.eye(4).to(X), X]) for _, X in sorted(places.items())], dim=1)
             splat = carry([splat], torch.from_numpy(normalization.motion_to_normal(shift.numpy())), 0, 1)
-            world, ids = splat_to_world(splat, normalization), splat.part_ids
         self.model.start(splat, self.tree, motions, normalization)
-        worlds = state["_model.worlds"]
+        world, worlds = splat_to_world(splat, normalization), state["_model.worlds"]
         self.bundle: Bundle = assemble_bundle(
             self.tree,
-            {p: world.select(ids == p) for p in capture.parts},
+            {p: world.select(world.part_ids == p) for p in capture.parts},
             part_motions,
             part_covariances,
             capture.parts,
@@ -291,6 +250,52 @@ class JointPipeline(StagePipeline):
                 **({} if capture.worlds == "shared" else {"worlds": worlds.tolist()}),
             },
         )
+
+    def _infer_tree(self, state: Mapping[str, Tensor], splat: Splat, known: Mapping[int, Tensor]) -> KinematicTree:
+        """The tree of a pose run's `state` and its splat, in the capture's world; `known` as of `known_states`."""
+        capture, config, ids = self.datamanager.capture, self.config, splat.part_ids
+        present = [p for p in capture.parts if bool((ids == p).any())]
+        root = next((p for p, name in capture.parts.items() if name == config.root), None)
+        if config.root is not None and not (root in present and known[root][0]):
+            raise InputError(
+                f"{capture.path} has no part '{config.root}' with Gaussians at state 0; choose another root."
+            )
+        # Joints are found about the object's place: the world's origin may be a thousand objects away, as a map's is.
+        here = replace(capture.normalization, centre=np.zeros(3))
+        beside = splat_to_world(splat, here)
+        motions = torch.from_numpy(here.motion_to_world(state["_model.poses.base"].numpy()))
+        covariances = covariances_to_world(state["_model.covariance"], here)
+        held = state["_model.held_ratio"]
+        tree = infer_tree(
+            {p: surface_points(beside.select(ids == p)) for p in present},
+            {p: motions[:, p - 1] for p in present},
+            covariances={p: covariances[:, p - 1] for p in present},
+            root=root,
+            render_ratios={
+                (a, b): float(held[a - 1, b - 1])
+                for a in present
+                for b in present
+                if a != b and bool(torch.isfinite(held[a - 1, b - 1]))
+            },
+            epsilon=config.epsilon,
+            method=config.method,
+            constraints=parse_constraints(config.joints, capture.parts, root),
+            names=capture.parts,
+        )
+        return doubted(shifted(tree, torch.from_numpy(capture.normalization.centre)), state["_model.alike"])
+
+
+def _read_pose_run(run: Path, capture: Capture) -> dict[str, Tensor]:
+    """The checkpoint of a finished splatart-pose run on a capture."""
+    S, P = len(capture.states), len(capture.parts)
+    other = (
+        f"{run} is no finished splatart-pose run on a capture of {S} states and {P} parts; "
+        f"run `ns-train splatart-pose --data {capture.path}` again."
+    )
+    state = read_checkpoint(run, SPLAT_SHAPES | _pose_shapes(S, P), other)
+    if not state["_model.merged"]:
+        raise InputError(other)
+    return state
 
 
 def doubted(tree: KinematicTree, alike: Tensor) -> KinematicTree:
