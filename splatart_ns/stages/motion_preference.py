@@ -29,18 +29,24 @@ more measured 1.08 to 1.18, hexagonal ones 1.03 to 1.12, other parts that are se
 DOUBTFUL = 2.0
 """So many times in place of `ALIKE` where the chosen motion may turn the part over: doors were seen to cost 1.4 times
 as much as turned over, in few views or as they are lit."""
+SUSPECT = 4.0
+"""A motion that fits this many times worse than each state's own Gaussians is searched for once more, more widely.
+Right ones measured 1.0 to 2.5, but for parts of which one state hides most."""
 AS_WELL = 1.2
 """Motions that cost less than this many times what each state's own Gaussians do fit as well as any."""
 
 
-def prefer_slide(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]:
+def prefer_slide(T: np.ndarray, cost: np.ndarray, order: list[int], own: float = math.inf) -> list[int]:
     """`order` of motions [C, 4, 4] by cost [C], with a slide first that fits nearly as well as a best one by which the
-    part turns over.
+    part turns over; `own` is what each state's own Gaussians cost.
 
     Where one state hides most of a part, no motion fits well: a drawer was seen to render a tenth better turned over.
+    What fits far worse than a state's own says still less: half a turn cost two thirds of what no motion did, and both
+    eight times `own` or more, of a base that rests under an opened screen.
     """
     turn = _angles(T)
-    slides = [i for i in order if turn[i] < math.radians(SLIDE_TURN) and cost[i] < ALIKE * cost[order[0]]]
+    times = DOUBTFUL if cost[order[0]] > SUSPECT * own else ALIKE
+    slides = [i for i in order if turn[i] < math.radians(SLIDE_TURN) and cost[i] < times * cost[order[0]]]
     if turn[order[0]] < TURNED_OVER or not slides:
         return order
     return [slides[0], *(i for i in order if i != slides[0])]

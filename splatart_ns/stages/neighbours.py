@@ -1,7 +1,8 @@
 """Parts that turn as what they touch lets them: where the images accept several motions, a joint is what decides.
 
 A button, a knob or a lampshade looks alike turned over, and what no view of its own state shows, or the light, may even
-make it fit better so. But a joint seldom turns a part by more than a right angle against what it hangs on.
+make it fit better so. But a joint seldom turns a part by more than a right angle against what it hangs on: only where
+none does by less is one believed to do so by more.
 """
 
 from __future__ import annotations
@@ -54,13 +55,18 @@ def turned_as_neighbours_let(
     rest = {p: T for p, T in alone.items() if motions[p].still}
     settled = rest.keys() | {p for p in upright if parts.jointed_to_any(p, alone)}
     waiting = parts.near.keys() - settled
+    found: dict[int, tuple[InitialMotion, int]] = {}
+    now = settled
     while waiting:
-        reached = {p: parts.near[p] & settled for p in waiting if parts.near[p] & settled}
-        for p, others in reached.items():
-            fixed = {q: motions[q].T for q in others}
-            motions[p] = _jointed(splats, views, p, motions[p], parts, fixed, rest)
-        if not (now := reached.keys() or waiting & upright):
+        for p in waiting:
+            if parts.near[p] & now:
+                fixed = {q: motions[q].T for q in parts.near[p] & settled}
+                found[p] = _jointed(splats, views, p, motions[p], parts, fixed, rest)
+        # What makes no joint with these waits for what else it touches: an arm that another carries.
+        ready = {p for p, (_, made) in found.items() if p in waiting and (made or not parts.near[p] & waiting)}
+        if not (now := ready or waiting & upright or waiting & found.keys()):
             break
+        motions |= {p: found[p][0] for p in now & found.keys()}
         settled |= now
         waiting -= now
     return motions
@@ -74,14 +80,14 @@ def _jointed(
     parts: _Parts,
     fixed: Mapping[int, Tensor],
     rest: Mapping[int, Tensor],
-) -> InitialMotion:
+) -> tuple[InitialMotion, int]:
     """Of a part's motion and those that look alike the first that a joint with a part makes that touches it, or rests:
     its front may touch other drawers alone. One that makes joints with several goes first: a hip moves against the body
-    and the leg. The motion itself if none makes any; `fixed` and `rest` are motions [4, 4]."""
+    and the leg. The motion itself if none makes any; `fixed` and `rest` are motions [4, 4]. And how many it makes."""
 
-    def joints(T: Tensor) -> int:
-        """With how much of what moves, and with what rests, which counts as one."""
-        against = {q: parts.may_be_jointed(part, q, inverse(T_q) @ T) for q, T_q in {**rest, **fixed}.items()}
+    def joints(T: Tensor, most: float = TURNED_OVER) -> int:
+        """With how much of what moves, and with what rests, which counts as one; turned by `most` at most."""
+        against = {q: parts.may_be_jointed(part, q, inverse(T_q) @ T, most) for q, T_q in {**rest, **fixed}.items()}
         return any(against[q] for q in rest) + sum(against[q] for q in fixed.keys() - rest.keys())
 
     choices = [motion.T, *motion.alike]
@@ -92,8 +98,11 @@ def _jointed(
         turned = turned[[joints(T) > 0 for T in turned]]
         choices += alike_in_even_light(splats, views, part, motion.T, turned)
     made = [joints(T) for T in choices]
+    if not any(made):  # a lid may open by more than a right angle; its hinge still passes by what it hangs on
+        made = [joints(T, math.pi) for T in choices]
     best = made.index(max(made))
-    return replace(motion, T=choices[best], alike=tuple(T for i, T in enumerate(choices) if i != best))
+    chosen = replace(motion, T=choices[best], alike=tuple(T for i, T in enumerate(choices) if i != best))
+    return chosen, made[best]
 
 
 @dataclass(frozen=True)
@@ -129,16 +138,16 @@ class _Parts:
         others = self.near[part] & motions.keys()
         return any(self.may_be_jointed(part, q, inverse(motions[q]) @ motions[part]) for q in others)
 
-    def may_be_jointed(self, a: int, b: int, T: Tensor) -> bool:
-        """Whether T [4, 4], by which part a moves against part b, slides it or turns it about a hinge of both, but not
-        over."""
+    def may_be_jointed(self, a: int, b: int, T: Tensor, most: float = TURNED_OVER) -> bool:
+        """Whether T [4, 4], by which part a moves against part b, slides it or turns it about a hinge of both, by
+        `most` at most."""
         turn = _turn(T)
         if turn < math.radians(SLIDE_TURN):
             return True
         contact = self.contacts[min(a, b), max(a, b)]
         screw = screw_from_motion(T, contact.points.mean(0))
         apart = contact.distance_to_axis(screw.axis, screw.point, through_holes=False)
-        return turn <= TURNED_OVER and apart < NEAR and abs(float(screw.slide)) < NEAR
+        return turn <= most and apart < NEAR and abs(float(screw.slide)) < NEAR
 
 
 def _turn(T: Tensor) -> float:

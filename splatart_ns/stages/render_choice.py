@@ -20,6 +20,7 @@ from splatart_ns.stages.motion_preference import (
     HALF_TURN,
     OTHERWISE,
     SIMILAR_TURN,
+    SUSPECT,
     TURNED_OVER,
     looks_alike,
     prefer_less_turn,
@@ -51,9 +52,6 @@ SIMILAR = 2.5
 """Candidates that cost more than this many times the best are dropped before refining."""
 OTHERS = 2
 """So many of these are kept beside the best."""
-SUSPECT = 4.0
-"""A motion that fits this many times worse than each state's own Gaussians is searched for once more, more widely.
-Right ones measured 1.0 to 2.5, but for parts of which one state hides most."""
 EXPLAINED = 1.8
 """Of such a part a motion that fits the images of one state at most this many times worse than that state's own
 Gaussians is preferred to what fits them as many times worse than it. Right ones measured 0.4 to 1.2 in one of the
@@ -152,7 +150,8 @@ def initial_motion(
     identity_ratio = identity_cost / max(best.cost, 1e-12)
     still = identity_ratio < STILL_RATIO
     maybe_moved = still and identity_ratio > RESTS_RATIO
-    if not still and identity_ratio < SHADED_RATIO and so3_log(best.T[:3, :3]).norm() > OTHERWISE / 2:
+    least = min(end.cost for end in ends)  # the preferred one may cost more, and says nothing of rest
+    if not still and identity_cost < SHADED_RATIO * least and so3_log(best.T[:3, :3]).norm() > OTHERWISE / 2:
         even = part_pair(splats, views, part, DOUBTFUL_VIEWS, FINE_PIXELS)
         stayed, turned = replace(even, **IN_EVEN_LIGHT).cost(torch.stack([identity, best.T])).tolist()
         still = stayed < STILL_RATIO * turned
@@ -287,8 +286,9 @@ def ranked(pair: PartPair, ends: Sequence[Refinement]) -> tuple[np.ndarray, np.n
     T = torch.stack([e.T for e in ends])
     cost, T = appearance_cost(pair, T), T.cpu().numpy()
     order = distinct(T, cost, pair.centroid.cpu().numpy(), pair.radius)
-    upright = cost[order[0]] < AS_WELL * own_appearance(pair) and prefer_upright(T, cost, order)
-    order = upright or prefer_slide(T, cost, order)
+    own = own_appearance(pair)
+    upright = cost[order[0]] < AS_WELL * own and prefer_upright(T, cost, order)
+    order = upright or prefer_slide(T, cost, order, own)
     return T, cost, prefer_less_turn(T, cost, prefer_turn(T, cost, order, pair.radius))
 
 

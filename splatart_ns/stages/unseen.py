@@ -7,14 +7,18 @@ to its parent, and its joint has the same value. In other unknown states it move
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
-from splatart_ns.geometry.se3 import inverse
+from splatart_ns.geometry.se3 import inverse, so3_log
 from splatart_ns.stages.articulate import KinematicTree
 from splatart_ns.stages.joint_fit import UNSEEN_ROTATION
+
+UNTURNED = 5
+"""Degrees by which a part that rests is turned at most."""
 
 
 def known_states(motions: Mapping[int, Tensor], covariances: Mapping[int, Tensor] | None) -> dict[int, Tensor]:
@@ -28,6 +32,20 @@ def may_have_turned(covariances: Tensor) -> Tensor:
     """Which motions [...], from their covariances [..., 6, 6], are of parts that may have turned by any angle."""
     rotation = covariances[..., 3:, 3:].double().nan_to_num()
     return torch.linalg.eigvalsh(rotation)[..., -1] > UNSEEN_ROTATION**2
+
+
+def rests(T: Tensor) -> bool:
+    """Whether motions T [S, 4, 4] hardly turn a part: by less than what refining leaves of those that rest."""
+    return bool((so3_log(T[..., :3, :3]).norm(dim=-1) < math.radians(UNTURNED)).all())
+
+
+def as_seen(covariances: Tensor) -> Tensor:
+    """Covariances [..., 6, 6] of parts that turned by nothing about the lines about which images do not tell it."""
+    C = covariances.double()
+    variances, directions = torch.linalg.eigh(C[..., 3:, 3:].nan_to_num())
+    unseen = torch.where(variances > UNSEEN_ROTATION**2, 1 / variances.clamp_min(1e-300), 0.0)
+    gain = C[..., 3:] @ directions @ torch.diag_embed(unseen) @ directions.mT
+    return C - gain @ C[..., 3:, :]
 
 
 def leads_blindly(known_a: Tensor, known_b: Tensor) -> bool:

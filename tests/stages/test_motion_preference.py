@@ -30,6 +30,12 @@ def test_a_slide_that_fits_nearly_as_well_is_preferred_to_turning_over():
     assert prefer_slide(T, np.array([1.1, 1.0, 1.15]), [1, 0, 2]) == [1, 0, 2]
 
 
+@pytest.mark.parametrize("own, first", [(0.2, 2), (0.3, 0)])
+def test_of_motions_that_all_fit_far_worse_than_a_states_own_gaussians_a_slide_is_preferred_sooner(own, first):
+    T = np.stack([motion(turn, (0, 0, 0)).numpy() for turn in ((0, 178, 0), (0, 0, 60), (0, 0, 2))])
+    assert prefer_slide(T, np.array([1.0, 1.05, 1.6]), [0, 1, 2], own)[0] == first
+
+
 def test_a_knob_that_fits_as_well_turned_by_less_is_not_turned_over():
     T = np.stack([motion(turn, (0, 0, 0)).numpy() for turn in ((0, 133, 0), (0, 0, 48), (0, 0, 0))])
     assert prefer_upright(T, np.array([1.0, 1.02, 1.03]), [0, 1, 2]) == [1, 0, 2]

@@ -196,3 +196,30 @@ def test_a_part_between_two_moves_against_both():
     states = Splat.cat([body, hip, leg, foot]), Splat.cat([body, *moved])
     found = turned_as_neighbours_let(states, ([], []), motions)
     assert torch.equal(found[2].T, right) and torch.equal(found[3].T, thigh)
+
+
+def test_a_lid_opens_by_more_than_a_right_angle_where_it_makes_no_joint_otherwise():
+    book, lid = box(1, (1.0, 0.8, 0.1), (0.0, 0.0, 0.0)), box(2, (1.0, 0.8, 0.06), (0.0, 0.0, 0.1))
+    T = about(motion((170, 0, 0), (0, 0, 0)), torch.tensor([0.0, -0.4, 0.07]).double())
+    far = about(motion((0, 10, 0), (0, 0, 0)), torch.tensor([5.0, 0.0, 0.0]).double())
+    states = Splat.cat([book, lid]), Splat.cat([book, lid.transformed(T)])
+    for first, second in ((far, T), (T, far)):
+        motions = {1: RESTS, 2: InitialMotion(first, found=True, alike=(second,))}
+        assert torch.equal(turned_as_neighbours_let(states, ([], []), motions)[2].T, T)
+
+
+def test_an_arm_that_makes_no_joint_with_the_base_it_lies_on_waits_for_the_arm_that_carries_it():
+    post, board = ((0.4, 0.4, 0.1), (-0.4, 0.0, 0.0), 0.03), ((1.2, 1.2, 0.1), (0.7, 0.6, 0.0), 0.1)
+    base = Splat.cat([box(1, *place, num_parts=3) for place in (post, board)])
+    first, second = (box(part, (0.8, 0.15, 0.1), (x, 0.0, 0.1), num_parts=3) for part, x in ((2, 0.0), (3, 0.8)))
+    carried = about(motion((0, 0, 30), (0, 0, 0)), torch.tensor([-0.4, 0.0, 0.1]).double())
+    T = carried @ about(motion((0, 0, 20), (0, 0, 0)), torch.tensor([0.4, 0.0, 0.1]).double())
+    wrong = T @ about(motion((0, 180, 0), (0, 0, 0)), torch.tensor([0.8, 0.2, 0.1]).double())
+    states = Splat.cat([base, first, second]), Splat.cat([base, first.transformed(carried), second.transformed(T)])
+    motions = {
+        1: RESTS,
+        2: InitialMotion(carried, found=True, alike=(carried @ motion((0, 0, 180), (0, 0, 0)),)),
+        3: InitialMotion(wrong, found=True, alike=(T,)),
+    }
+    found = turned_as_neighbours_let(states, ([], []), motions)
+    assert torch.equal(found[2].T, carried) and torch.equal(found[3].T, T)

@@ -7,11 +7,11 @@ import torch
 from part_scene import angle_deg, box, motion, photograph
 
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.motion_preference import SUSPECT
 from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.render_choice import (
     COARSE_PIXELS,
     FINE_PIXELS,
-    SUSPECT,
     explained_by_one_state,
     initial_motion,
     ranked,

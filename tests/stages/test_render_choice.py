@@ -163,6 +163,25 @@ def test_a_square_part_with_a_print_that_turned_a_quarter_did_not_stay():
     assert found.identity_ratio < SHADED_RATIO
 
 
+def test_a_part_does_not_rest_for_that_what_is_preferred_fits_hardly_better(monkeypatch):
+    """A print that turned a quarter; half a turn, were it preferred, would fit but half as badly as none."""
+    T = motion((0, 0, 90), (0, 0, 0))
+    blotches = blotched_plate(T, lambda x, _: 0.8 * (x[:, :2].amin(1) > 0.0)[:, None] * torch.tensor([1.0, -1.0, -1.0]))
+
+    def with_dear(coarse, fine, candidates):
+        ends = refined(coarse, fine, candidates)
+        none = float(fine.cost(torch.eye(4, dtype=torch.float64)[None])[0])
+        return [*ends, replace(ends[0], T=T @ T, cost=0.55 * none)]
+
+    def dear_first(pair, ends):
+        motions, cost, order = ranked(pair, ends)
+        return motions, cost, [len(ends) - 1, *order]
+
+    monkeypatch.setattr(render_choice, "refined", with_dear)
+    monkeypatch.setattr(render_choice, "ranked", dear_first)
+    assert not initial_motion(*blotches, part=1).still
+
+
 def test_a_tin_that_looks_alike_upside_down_but_for_its_colour_is_not_flipped():
     T = motion((180, 0, 0), (0.0, 0.3, 0.0))
     plate = box(1, (1.0, 1.0, 0.1), (0.0, 0.0, 0.0), spacing=0.08)

@@ -110,14 +110,17 @@ def test_a_disc_that_the_user_says_does_not_turn_is_fixed(told):
 
 
 @pytest.mark.parametrize("root", [None, 1])
-def test_a_round_root_that_stood_still_did_not_turn_unseen(root):
-    """A table with a round plain foot and a door on it: if the foot turned, so did the world."""
+@pytest.mark.parametrize("error", [0.0, 0.002])
+def test_a_round_root_that_stood_still_did_not_turn_unseen(root, error):
+    """A table with a round plain foot and a door on it: if the foot turned, so did the world. The images may leave a
+    little of what they do tell of it."""
     points, motions, covariances = round_part_and_door()
-    points, motions = {1: points[1], 3: points[3]}, {1: motions[1], 3: motions[3]}
+    points, motions = {1: points[1], 3: points[3]}, {1: motions[1].clone(), 3: motions[3]}
+    motions[1][1, :3, :3] = so3_exp(error * X)
     unseen = torch.zeros(2, 6, 6, dtype=torch.float64)
     unseen[1, 5, 5] = math.pi**2 / 3
     tree = infer_tree(points, motions, covariances={1: covariances[1] + unseen, 3: covariances[3]}, root=root)
     assert tree.root == 1
     (joint,) = tree.joints
     assert joint.fit.type == "revolute" and not joint.fit.ambiguous
-    assert float(joint.fit.values[1]) == pytest.approx(0.7, abs=1e-3)
+    assert float(joint.fit.values[1]) == pytest.approx(0.7, abs=1e-3 + error)
