@@ -60,6 +60,7 @@ def check_capture(path: Path) -> tuple[Capture | None, list[Problem]]:
             problems.append(Problem("warning", capture.path / state.name, strange, OTHER_WORLDS_MEND))
         problems.extend(_check_silhouettes(capture, state, [by_frame[id(f)] for f in state.frames]))
         problems.extend(_check_steps(capture, state, [by_frame[id(f)] for f in state.frames]))
+        problems.extend(_check_background(capture, state, [by_frame[id(f)] for f in state.frames]))
         if (train := state.split("train")) and all(by_frame[id(f)].masked_out for f in train):
             found, mend = "the masks leave no pixel of any training frame", "white must be what counts: invert them"
             problems.append(Problem("error", capture.path / state.name, found, mend))
@@ -206,6 +207,17 @@ def _check_steps(capture: Capture, state: State, contents: list[_Content]) -> It
         found += " or more apart are rims of ids in between"
         mend = "export them without anti-aliasing, and resize them by the nearest neighbour"
         yield Problem("warning", capture.path / state.name, found, mend)
+
+
+def _check_background(capture: Capture, state: State, contents: list[_Content]) -> Iterator[Problem]:
+    """Without silhouettes, labels alone tell the object from what surrounds it."""
+    train = [(f, content) for f, content in zip(state.frames, contents, strict=True) if f.split == "train"]
+    pixels = sum((content.pixels for _, content in train), _NO_PIXELS)
+    outlined = any(frame.object_mask is not None or content.silhouette is not None for frame, content in train)
+    if pixels[1:UNLABELLED].any() and not pixels[0] and not outlined:
+        found = "no labelled frame tells where the object ends"
+        mend = f"label what surrounds it as 0 ({UNLABELLED} says that nobody knows), or give object_mask_path"
+        yield Problem("error", capture.path / state.name, found, mend)
 
 
 def _check_points(state: State) -> Iterator[Problem]:
