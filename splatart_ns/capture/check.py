@@ -74,6 +74,7 @@ def check_capture(path: Path) -> tuple[Capture | None, list[Problem]]:
     return capture, list(dict.fromkeys(problems))
 
 
+ONE_SPOT_MEND = "give views from around the object, with poses relative to the object's fixed world"
 _INVERTED = 0.9
 """Silhouettes are inverted if they leave out more than this share of all labelled pixels."""
 _BLURRED, _ENOUGH_STEPS = 0.3, 100
@@ -170,9 +171,7 @@ def _check_cameras(capture: Capture, state: State) -> Iterator[Problem]:
     centres = np.stack([f.T_world_camera[:3, 3] for f in frames])
     if np.ptp(centres, axis=0).max() * capture.normalization.scale < 1e-3:
         found = "there is one training view" if len(frames) == 1 else "all training cameras stand on one spot"
-        yield Problem(
-            "error", place, found, "give views from around the object, with poses relative to the object's fixed world"
-        )
+        yield Problem("error", place, found, ONE_SPOT_MEND)
 
 
 def _check_silhouettes(capture: Capture, state: State, contents: list[_Content]) -> Iterator[Problem]:
