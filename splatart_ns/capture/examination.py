@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from filecmp import cmp
 from pathlib import Path
 
 import numpy as np
@@ -163,8 +164,8 @@ def examine(path: Path | str, suggest: int = 0) -> Examination:
     - Silhouettes: whether any point projects inside all of them, and which do not fit the others' visual hull.
     - Labels: frames that contradict the other frames on a part, by votes on the hull's surface; outlines of labels
       against silhouettes; parts that few labelled frames show.
-    - States: whether a part moved, and whether one stayed, between the first state and the others, if these share a
-      world; whether parts are as large in the others as in the first.
+    - States: whether one shows an earlier one's images; whether a part moved, and whether one stayed, between the first
+      state and the others, if these share a world; whether parts are as large in the others as in the first.
 
     `suggest` frames to label next are chosen one after the other: the training frame that adds most to
     sum_v w_v (1 - 2^-n_v), where n_v labelled frames see the point v of the surface and w_v = 1 / (points of its part),
@@ -191,7 +192,11 @@ def examine(path: Path | str, suggest: int = 0) -> Examination:
     if any(problem.mend in (POSES_MEND, ONE_SPOT_MEND) and problem.severity == "error" for problem in problems):
         # Wrong poses make cameras look anywhere.
         problems = [problem for problem in problems if problem.mend != OTHER_WORLDS_MEND]
-    for other in evidence[1:]:
+    for k, other in enumerate(evidence[1:], start=1):
+        if twin := next((state for state in capture.states[:k] if _same_images(state, other.state)), None):
+            found, mend = f"it shows the same images as {twin.name}", "give it those of another configuration"
+            problems.append(Problem("warning", capture.path / other.state.name, found, mend))
+            continue
         elsewhere = list(_check_motion(capture, evidence[0], other)) if capture.worlds == "shared" else []
         problems.extend(elsewhere)
         if not elsewhere and capture.worlds != "similar":
@@ -365,6 +370,15 @@ def _check_coverage(capture: Capture, one: _Evidence) -> Iterator[Problem]:
 
 
 # ---------------------------------------------------------------------------------------------- states
+
+
+def _same_images(a: State, b: State) -> bool:
+    """Whether the images of two states, in their order, are the same byte by byte."""
+    pairs = zip(a.frames, b.frames, strict=False)
+    try:
+        return len(a.frames) == len(b.frames) and all(cmp(x.image, y.image, shallow=False) for x, y in pairs)
+    except OSError:  # `check_capture` has told
+        return False
 
 
 def _in_place(a: _Evidence, b: _Evidence, num_parts: int) -> Tensor:

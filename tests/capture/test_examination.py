@@ -66,6 +66,27 @@ def labelled_once(labels):
     return np.where(labels == 2, 255, labels).astype(np.uint8)
 
 
+def copy_state(capture):
+    shutil.rmtree(capture / "state_01")
+    shutil.copytree(capture / "state_00", capture / "state_01")
+
+
+def opaque_images(capture):
+    for state in ("state_00", "state_01"):
+        change_json(
+            capture / state / "transforms.json",
+            lambda meta: [frame.pop("object_mask_path") for frame in meta["frames"]],
+        )
+        change_all(capture / state / "images", lambda image: image[..., :3])
+
+
+def unlabelled_surroundings(capture):
+    """But for a few of its pixels, so that no frame has a silhouette."""
+    rows = np.arange(64)[:, None] > 0
+    for state in ("state_00", "state_01"):
+        change_all(capture / state / "semantics", lambda labels: np.where((labels == 0) & rows, 255, labels))
+
+
 LABELS = "state_01/semantics/0005.png"
 MASK = "state_01/masks/0005.png"
 DEFECTS = {
@@ -124,8 +145,12 @@ DEFECTS = {
         {"state_01": "parts measure 0."},
     ),
     "no motion": (
-        lambda c: [shutil.rmtree(c / "state_01"), shutil.copytree(c / "state_00", c / "state_01")],
+        lambda c: [copy_state(c), change_all(c / "state_01/images", lambda image: image // 2 * 2)],
         {"state_01": "no part seems to have moved since state_00"},
+    ),
+    "a state that is a copy": (
+        lambda c: [copy_state(c), opaque_images(c), unlabelled_surroundings(c)],
+        {"state_01": "it shows the same images as state_00"},
     ),
 }
 
@@ -194,15 +219,6 @@ def test_a_few_labelled_neighbours_do_not_make_states_seem_to_have_other_worlds(
         near = np.argsort(np.linalg.norm(centres - centres[1], axis=1))
         unlabel(capture, state.name, near[count:])
     assert [p for p in examine(capture).problems if "labelled training frame" not in p.message] == []
-
-
-def opaque_images(capture):
-    for state in ("state_00", "state_01"):
-        change_json(
-            capture / state / "transforms.json",
-            lambda meta: [frame.pop("object_mask_path") for frame in meta["frames"]],
-        )
-        change_all(capture / state / "images", lambda image: image[..., :3])
 
 
 def test_silhouettes_may_come_from_the_labels(capture):
