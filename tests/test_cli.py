@@ -126,6 +126,12 @@ def test_check_tells_all_problems(run_main, hinge_capture, tmp_path):
     assert last == "2 errors, 0 warnings"
 
 
+def test_a_home_that_the_shell_left_as_it_is_is_found(run_main, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert f"{tmp_path}/nothing: " in run_main("check", "~/nothing")[1]
+    assert f"--sheet {tmp_path}/sheet.txt;" in run_main("check", "~/nothing", "--sheet=~/sheet.txt")[2]
+
+
 def test_a_fitted_bundle_moves_in_a_simulator(run_main, hinge_fit, tmp_path):
     pytest.importorskip("mujoco", reason="mujoco is not installed: extra 'sim'")
     code, output, _ = run_main("export", hinge_fit, "--format", "mjcf", "--output", tmp_path / "robot")

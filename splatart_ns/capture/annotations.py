@@ -37,7 +37,8 @@ def read_annotations(path: Path) -> Annotations:
     - COCO: `.json` files with `images`, `annotations` and `categories`; polygons, runs, compressed runs.
     - YOLO: `.txt` files of "class x y x y ..." lines, coordinates from 0 to 1, beside a `data.yaml` or `classes.txt`.
     - Masks: PNGs of class ids in one channel, beside Roboflow's `_classes.csv` ("Pixel Value, Class"), or a
-      `classes.txt` whose line numbers are the ids, from 0 if the first is "background", else from 1. `x.png` beside
+      `classes.txt` whose line numbers are the ids, from 0 if the first is "background", else from 1. PNGs of colours,
+      beside CVAT's `labelmap.txt` ("name:r,g,b:parts:actions"), or a `_classes.csv` of "name,r,g,b". `x.png` beside
       `x_mask.png`, and what lies in a folder of images beside one of masks, is none.
 
     An image without a shape, or whose mask holds the background alone, is not labelled; later shapes cover earlier

@@ -60,6 +60,7 @@ def check_capture(path: Path) -> tuple[Capture | None, list[Problem]]:
             problems.append(Problem("warning", capture.path / state.name, strange, OTHER_WORLDS_MEND))
         problems.extend(_check_silhouettes(capture, state, [by_frame[id(f)] for f in state.frames]))
         problems.extend(_check_steps(capture, state, [by_frame[id(f)] for f in state.frames]))
+        problems.extend(_check_background(capture, state, [by_frame[id(f)] for f in state.frames]))
         if (train := state.split("train")) and all(by_frame[id(f)].masked_out for f in train):
             found, mend = "the masks leave no pixel of any training frame", "white must be what counts: invert them"
             problems.append(Problem("error", capture.path / state.name, found, mend))
@@ -73,6 +74,7 @@ def check_capture(path: Path) -> tuple[Capture | None, list[Problem]]:
     return capture, list(dict.fromkeys(problems))
 
 
+ONE_SPOT_MEND = "give views from around the object, with poses relative to the object's fixed world"
 _INVERTED = 0.9
 """Silhouettes are inverted if they leave out more than this share of all labelled pixels."""
 _BLURRED, _ENOUGH_STEPS = 0.3, 100
@@ -169,9 +171,7 @@ def _check_cameras(capture: Capture, state: State) -> Iterator[Problem]:
     centres = np.stack([f.T_world_camera[:3, 3] for f in frames])
     if np.ptp(centres, axis=0).max() * capture.normalization.scale < 1e-3:
         found = "there is one training view" if len(frames) == 1 else "all training cameras stand on one spot"
-        yield Problem(
-            "error", place, found, "give views from around the object, with poses relative to the object's fixed world"
-        )
+        yield Problem("error", place, found, ONE_SPOT_MEND)
 
 
 def _check_silhouettes(capture: Capture, state: State, contents: list[_Content]) -> Iterator[Problem]:
@@ -206,6 +206,17 @@ def _check_steps(capture: Capture, state: State, contents: list[_Content]) -> It
         found += " or more apart are rims of ids in between"
         mend = "export them without anti-aliasing, and resize them by the nearest neighbour"
         yield Problem("warning", capture.path / state.name, found, mend)
+
+
+def _check_background(capture: Capture, state: State, contents: list[_Content]) -> Iterator[Problem]:
+    """Without silhouettes, labels alone tell the object from what surrounds it."""
+    train = [(f, content) for f, content in zip(state.frames, contents, strict=True) if f.split == "train"]
+    pixels = sum((content.pixels for _, content in train), _NO_PIXELS)
+    outlined = any(frame.object_mask is not None or content.silhouette is not None for frame, content in train)
+    if pixels[1:UNLABELLED].any() and not pixels[0] and not outlined:
+        found = "no labelled frame tells where the object ends"
+        mend = f"label what surrounds it as 0 ({UNLABELLED} says that nobody knows), or give object_mask_path"
+        yield Problem("error", capture.path / state.name, found, mend)
 
 
 def _check_points(state: State) -> Iterator[Problem]:

@@ -14,8 +14,12 @@ UNLABELLED_NAMES = ("unlabelled", "unlabeled", "ignore", "void")
 """Classes of these names are no parts."""
 CLASS_LISTS = ("classes.txt", "obj.names", "_darknet.labels")
 """Files with a name a line."""
-Names = dict[int, str]
-"""A list of classes: names by their numbers, lines or pixel values."""
+COLOUR_LIST = "labelmap.txt"
+"""CVAT's file with a name and a colour a line."""
+Colour = tuple[int, int, int]
+"""Red, green and blue, 0..255."""
+Names = dict[int, str] | dict[Colour, str]
+"""A list of classes: names by their numbers, lines, pixel values or colours."""
 
 
 def listed_classes(path: Path, files: Sequence[Path], wanted: str) -> list[tuple[Path, list[str]]]:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from filecmp import cmp
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.capture import UNLABELLED, Capture, Frame, Normalization, Problem, State
-from splatart_ns.capture.check import check_capture
+from splatart_ns.capture.check import ONE_SPOT_MEND, check_capture
 from splatart_ns.capture.hull import (
     POSES_MEND,
     carve,
@@ -126,6 +127,8 @@ class _Evidence:
     normalization: Normalization
     frames: list[Frame]
     views: list[View]
+    labelled_for_training: list[View]
+    """Also those that fit no others, which `views` lose."""
     points: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
     """Voxels of the surface [N, 3] in the state's normalised world; none where there is no hull."""
     size: float = 0.0
@@ -161,8 +164,8 @@ def examine(path: Path | str, suggest: int = 0) -> Examination:
     - Silhouettes: whether any point projects inside all of them, and which do not fit the others' visual hull.
     - Labels: frames that contradict the other frames on a part, by votes on the hull's surface; outlines of labels
       against silhouettes; parts that few labelled frames show.
-    - States: whether a part moved, and whether one stayed, between the first state and the others, if these share a
-      world; whether parts are as large in the others as in the first.
+    - States: whether one shows an earlier one's images; whether a part moved, and whether one stayed, between the first
+      state and the others, if these share a world; whether parts are as large in the others as in the first.
 
     `suggest` frames to label next are chosen one after the other: the training frame that adds most to
     sum_v w_v (1 - 2^-n_v), where n_v labelled frames see the point v of the surface and w_v = 1 / (points of its part),
@@ -176,18 +179,24 @@ def examine(path: Path | str, suggest: int = 0) -> Examination:
         return Examination(None, tuple(problems))
     evidence = [_read_evidence(state) for state in capture.states]
     num_parts = max(capture.parts, default=0)
+    on_one_spot = [problem.file for problem in problems if problem.mend == ONE_SPOT_MEND]
     for one in evidence:
-        problems.extend(_carve(capture, one))
-        problems.extend(_check_depth(capture, one))
-        problems.extend(_check_outlines(capture, one))
+        if capture.path / one.state.name not in on_one_spot:  # from where frames tell nothing of each other
+            problems.extend(_carve(capture, one))
+            problems.extend(_check_depth(capture, one))
+            problems.extend(_check_outlines(capture, one))
         if len(one.points) and one.labelled:
             one.votes = vote(one.labelled, one.points, one.size, num_parts)
             problems.extend(_check_votes(capture, one))
         problems.extend(_check_coverage(capture, one))
-    if any(problem.mend == POSES_MEND and problem.severity == "error" for problem in problems):
-        # Wrong axes make cameras look anywhere.
+    if any(problem.mend in (POSES_MEND, ONE_SPOT_MEND) and problem.severity == "error" for problem in problems):
+        # Wrong poses make cameras look anywhere.
         problems = [problem for problem in problems if problem.mend != OTHER_WORLDS_MEND]
-    for other in evidence[1:]:
+    for k, other in enumerate(evidence[1:], start=1):
+        if twin := next((state for state in capture.states[:k] if _same_images(state, other.state)), None):
+            found, mend = f"it shows the same images as {twin.name}", "give it those of another configuration"
+            problems.append(Problem("warning", capture.path / other.state.name, found, mend))
+            continue
         elsewhere = list(_check_motion(capture, evidence[0], other)) if capture.worlds == "shared" else []
         problems.extend(elsewhere)
         if not elsewhere and capture.worlds != "similar":
@@ -218,7 +227,8 @@ def _read_evidence(state: State) -> _Evidence:
     with ThreadPoolExecutor(num_cores()) as pool:
         views = list(pool.map(read, frames))
     kept = [(frame, view) for frame, view in zip(frames, views, strict=True) if view is not None]
-    return _Evidence(state, normalization, [frame for frame, _ in kept], [view for _, view in kept])
+    labelled = [view for frame, view in kept if view.labels is not None and frame.split == "train"]
+    return _Evidence(state, normalization, [frame for frame, _ in kept], [view for _, view in kept], labelled)
 
 
 def _spread(frames: list[Frame], count: int) -> list[Frame]:
@@ -242,16 +252,18 @@ def _carve(capture: Capture, one: _Evidence) -> Iterator[Problem]:
         yield Problem("error", place, found, POSES_MEND)
         return
     fitting = fitting_views(carving)
-    if fitting is None:
+    if fitting is None or 2 * fitting.sum() < len(fitting):
         outside = float(carving.uncovered(torch.ones(len(known), dtype=torch.bool)).median())
         found = f"the silhouettes do not fit: {outside:.0%} of a frame's lies inside no point that all frames accept"
         yield Problem("error" if outside > 0.5 else "warning", place, found, POSES_MEND)
         return
     odd = [known[i] for i in torch.nonzero(~fitting).flatten().tolist()]
-    for frame in (one.frames[i] for i in odd):
-        found = f"the silhouette of {frame.name} does not fit those of the other frames"
-        mend = "correct its pose or its mask, or take the frame out"
-        yield Problem("warning", frame.object_mask or frame.image, found, mend)
+    for frame, view in ((one.frames[i], one.views[i]) for i in odd):
+        what, cause, file = "silhouette", "mask", frame.object_mask or frame.image
+        if view.alpha is None:
+            what, cause, file = "outline of the labels", "labels", frame.labels
+        found = f"the {what} of {frame.name} does not fit those of the other frames"
+        yield Problem("warning", file, found, f"correct its pose or its {cause}, or take the frame out")
     one.points, one.size = carving.surface(fitting), carving.size
     one.frames = [frame for i, frame in enumerate(one.frames) if i not in odd]
     one.views = [view for i, view in enumerate(one.views) if i not in odd]
@@ -344,19 +356,13 @@ def _shows(view: View, part: int) -> bool:
 
 
 def _coverage(one: _Evidence, part: int, name: str) -> Coverage:
-    labelled = _labelled_for_training(one)
+    labelled = one.labelled_for_training
     return Coverage(one.state.name, name, sum(_shows(view, part) for view in labelled), len(labelled))
 
 
-def _labelled_for_training(one: _Evidence) -> list[View]:
-    pairs = zip(one.frames, one.views, strict=True)
-    return [view for frame, view in pairs if view.labels is not None and frame.split == "train"]
-
-
 def _check_coverage(capture: Capture, one: _Evidence) -> Iterator[Problem]:
-    labelled = _labelled_for_training(one)
     for i, name in capture.parts.items():
-        count = sum(_shows(view, i) for view in labelled)
+        count = sum(_shows(view, i) for view in one.labelled_for_training)
         if 0 < count < _FEW_FRAMES:
             found = f"part {i} ({name}) is seen in {count} labelled training frame" + "s" * (count > 1)
             mend = "label more frames that show it; `splatart check --suggest 3` names some"
@@ -364,6 +370,15 @@ def _check_coverage(capture: Capture, one: _Evidence) -> Iterator[Problem]:
 
 
 # ---------------------------------------------------------------------------------------------- states
+
+
+def _same_images(a: State, b: State) -> bool:
+    """Whether the images of two states, in their order, are the same byte by byte."""
+    pairs = zip(a.frames, b.frames, strict=False)
+    try:
+        return len(a.frames) == len(b.frames) and all(cmp(x.image, y.image, shallow=False) for x, y in pairs)
+    except OSError:  # `check_capture` has told
+        return False
 
 
 def _in_place(a: _Evidence, b: _Evidence, num_parts: int) -> Tensor:

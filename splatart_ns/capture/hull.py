@@ -202,8 +202,9 @@ def visible(view: View, points: Tensor, size: float) -> Tensor:
 
 
 def footprint(view: View, size: float) -> int:
-    """Half a voxel's diagonal in pixels, so that no thin part falls between the voxels' centres."""
-    return round(0.87 * size * float(view.K[0, 0] / view.viewmat[:3, 3].norm().clamp_min(0.1)))
+    """Half a voxel's diagonal in pixels, so that no thin part falls between the voxels' centres; at most the image."""
+    pixels = 0.87 * size * float(view.K[0, 0] / view.viewmat[:3, 3].norm().clamp_min(0.1))
+    return round(min(max(view.width, view.height), pixels))
 
 
 def widened(mask: Tensor, reach: int) -> Tensor:

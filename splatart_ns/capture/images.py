@@ -23,6 +23,7 @@ from splatart_ns.errors import InputError
 from splatart_ns.files import replacing
 
 _PNG = b"\x89PNG\r\n\x1a\n"
+_PNG_END = b"IEND\xaeB`\x82"
 _JPEG = b"\xff\xd8\xff"
 _PNG_COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGBA"}
 _LABELS_MEND = "save the part ids themselves in one grey channel of 8 or 16 bits, without colours"
@@ -278,8 +279,10 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
     if width * height > _MOST_PIXELS:
         found = f"the image has more than {_MOST_PIXELS >> 20} mega pixels"
         raise CaptureError(path, found, "scale it down, and its intrinsics with it")
-    # OpenCV fills the missing part of a cut-off JPEG with grey; its end marker must follow the last scan's start.
+    # OpenCV fills the missing part of a cut-off JPEG with grey; its end marker must follow the last scan's start. Of a
+    # cut-off PNG libpng writes lines of its own.
     cut_off = data.startswith(_JPEG) and data.find(b"\xff\xd9", max(data.rfind(b"\xff\xda"), 0)) < 0
+    cut_off |= data.startswith(_PNG) and _PNG_END not in data
     try:
         known = width > 0 and not cut_off
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if known else None

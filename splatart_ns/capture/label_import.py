@@ -30,6 +30,8 @@ from splatart_ns.machine import num_cores
 
 FRAME_FILES = ("file_path", "semantics_path", "mask_path", "object_mask_path", "depth_file_path")
 """Where a frame in a transforms.json names its files."""
+_TRUTH = ("ground_truth.json", "ground_truth_points")
+"""What evaluation reads beside the states."""
 _QUERY = re.compile(rf"(?<=\.)({'|'.join(suffix[1:] for suffix in IMAGE_SUFFIXES)})[?#].*", re.IGNORECASE | re.DOTALL)
 """What follows an image's name in an address."""
 
@@ -57,8 +59,9 @@ def import_capture(sources: Sequence[Path], output_dir: Path, labels: Path | Non
         output_dir: a folder that does not exist yet, or is empty.
         labels: as `import_labels` takes them.
 
-    Links to folders, and links that leave a source, are not copied; absolute paths in a transforms.json become relative
-    ones.
+    Of a source with transforms.json files these, the files that they name and the ground truth are copied; of other
+    layouts all. Links to folders, and links that leave a source, are not copied; absolute paths in a transforms.json
+    become relative ones.
 
     Raises:
         InputError: anything that cannot be read or written; labels that fit no frame, or not the frames' sizes.
@@ -154,9 +157,14 @@ def _copy(source: Path, target: Path, output_dir: Path) -> None:
     if is_inside(source, output_dir):
         raise InputError(f"{output_dir}: lies inside {source}; give an output folder beside it.")
 
+    needed = _needed(source)
+
     def left_out(folder: str, names: list[str]) -> list[str]:
         paths = [Path(folder, name) for name in names]
         kept = [p.is_file() and is_inside(source, p) or p.is_dir() and not p.is_symlink() for p in paths]
+        if needed is not None:
+            inner = [p.relative_to(source) for p in paths]
+            kept = [k and (p in needed or p.parts[0] in _TRUTH) for k, p in zip(kept, inner, strict=True)]
         return [p.name for p, keep in zip(paths, kept, strict=True) if not keep]
 
     try:
@@ -167,6 +175,38 @@ def _copy(source: Path, target: Path, output_dir: Path) -> None:
         _name_own_files(file, source, target)
 
 
+def _needed(source: Path) -> set[Path] | None:
+    """What a source's transforms.json files name, these, and the folders of both, as paths from the source; None where
+    there is none."""
+    needed = {file.relative_to(source) for file in source.rglob(TRANSFORMS)}
+    for file in list(needed):
+        try:
+            named = [values.get(key) for values, key in _file_names(read_json(source / file))]
+        except CaptureError:  # it belongs to no state: those have been read
+            continue
+        places = (_place(source, source / file.parent / value) for value in named if isinstance(value, str))
+        needed.update(place for place in places if place is not None)
+    return needed.union(*(place.parents for place in needed)) or None
+
+
+def _file_names(meta: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str]]:
+    """Where a transforms.json may name files: objects in it and their keys."""
+    entries = meta.get("frames")
+    for entry in entries if isinstance(entries, list) else ():
+        if isinstance(entry, dict):
+            yield from ((entry, key) for key in FRAME_FILES)
+    yield meta, "ply_file_path"
+
+
+def _place(source: Path, path: Path) -> Path | None:
+    """Where a path, its folders' links followed, leads below a source; None where it leaves it."""
+    if not is_inside(source, path):
+        return None
+    root = os.path.realpath(source)
+    places = [Path(os.path.realpath(path.parent), path.name), Path(os.path.realpath(path))]
+    return next(place.relative_to(root) for place in places if place.is_relative_to(root))
+
+
 def _name_own_files(file: Path, source: Path, target: Path) -> None:
     """Let a transforms.json of a copy name the copy's files where it leads to the source's: by absolute paths, or by
     relative ones that leave the source and come back."""
@@ -175,27 +215,19 @@ def _name_own_files(file: Path, source: Path, target: Path) -> None:
     def own(value: Any) -> Any:
         if not isinstance(value, str) or not os.path.normpath(folder / value).startswith(("/", "..")):
             return value
-        path = source / folder / value
-        if not is_inside(source, path):
-            return value
-        root = os.path.realpath(source)
-        places = [Path(os.path.realpath(path.parent), path.name), Path(os.path.realpath(path))]
-        place = next(place for place in places if place.is_relative_to(root))
-        return Path(os.path.relpath(place.relative_to(root), folder)).as_posix()
+        place = _place(source, source / folder / value)
+        return value if place is None else Path(os.path.relpath(place, folder)).as_posix()
 
     try:
         meta = read_json(file)
     except CaptureError:  # it belongs to no state: those have been read
         return
-    entries = meta.get("frames")
-    named = [(entry, FRAME_FILES) for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
     changed = False
-    for values, keys in [*named, (meta, ("ply_file_path", *(f"{split}_filenames" for split in SPLITS)))]:
-        for key in keys:
-            value = values.get(key)
-            new = [own(each) for each in value] if isinstance(value, list) else own(value)
-            if new != value:
-                values[key], changed = new, True
+    for values, key in chain(_file_names(meta), ((meta, f"{split}_filenames") for split in SPLITS)):
+        value = values.get(key)
+        new = [own(each) for each in value] if isinstance(value, list) else own(value)
+        if new != value:
+            values[key], changed = new, True
     if changed:
         write_json(file, meta)
 

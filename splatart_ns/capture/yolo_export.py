@@ -10,7 +10,7 @@ import numpy as np
 
 from splatart_ns.capture.annotated_image import IMAGE_SUFFIXES, AnnotatedImage, Split, corners_of
 from splatart_ns.capture.capture import CaptureError
-from splatart_ns.capture.class_list import CLASS_LISTS, Names, check_classes, listed_classes
+from splatart_ns.capture.class_list import CLASS_LISTS, COLOUR_LIST, Names, check_classes, listed_classes
 from splatart_ns.capture.images import image_size, orientation
 from splatart_ns.capture.rasters import fill_polygon
 from splatart_ns.capture.values import read_text, read_yaml, show
@@ -21,7 +21,7 @@ _CLASS_YAMLS = ("data.yaml", "data.yml", "dataset.yaml")
 def yolo_texts(path: Path, files: Sequence[Path]) -> list[Path]:
     """Texts in folders called `labels`; without any, all but lists of images, as darknet's train.txt, where there is a
     data.yaml or one of them looks like YOLO."""
-    texts = [f for f in files if f.suffix == ".txt" and f.name not in CLASS_LISTS]
+    texts = [f for f in files if f.suffix == ".txt" and f.name not in (*CLASS_LISTS, COLOUR_LIST)]
     if inner := [f for f in texts if "labels" in f.relative_to(path).parts]:
         return inner
     heads = {f: _first_line(f) for f in texts if not f.name.upper().startswith("README")}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import warnings
 
@@ -59,12 +60,18 @@ def main() -> None:
 
 
 def _run() -> None:
+    # Shells leave a ~ in quotes, and after --data=, as it is.
+    arguments = [re.sub("^(--[a-z-]+=)?(~.*)", _with_home, argument, flags=re.DOTALL) for argument in sys.argv[1:]]
     try:
-        tyro.extras.subcommand_cli_from_dict(_COMMANDS, prog="splatart", description=__doc__).run()
+        tyro.extras.subcommand_cli_from_dict(_COMMANDS, prog="splatart", description=__doc__, args=arguments).run()
     except SystemExit:
         sys.stdout.flush()
         raise
     sys.stdout.flush()
+
+
+def _with_home(argument: re.Match[str]) -> str:
+    return (argument[1] or "") + os.path.expanduser(argument[2])
 
 
 def _is_interrupt(error: BaseException | None) -> bool:

@@ -105,6 +105,30 @@ def write_masks(capture: Capture, folder: Path, name: Naming = roboflow_name) ->
     return folder
 
 
+_COLOURS = {0: (0, 0, 0), 1: (200, 60, 0), 2: (0, 0, 255), 255: (255, 255, 255)}
+
+
+def write_colours(capture: Capture, folder: Path, line: str, name: Naming = flat_name) -> Path:
+    """As CVAT writes them, and simulators; a `line` of the list of classes has a name and a colour."""
+    (folder / "SegmentationClass").mkdir(parents=True)
+    names = {0: "background", **capture.parts, 255: "void"}
+    lines = [line.format(names[i], *_COLOURS[i]) for i in _COLOURS]
+    if ":" in line:
+        (folder / "labelmap.txt").write_text("\n".join(["# label:color_rgb:parts:actions", *lines]))
+        (folder / "default.txt").write_text("0000\n0001\n")
+    else:
+        (folder / "_classes.csv").write_text("\n".join(["name,r,g,b", *lines]))
+    colours = np.zeros((256, 3), np.uint8)
+    colours[[*_COLOURS]] = [*_COLOURS.values()]
+    for state, frame, labels in _labelled(capture):
+        file = f"{Path(name(state, frame)).stem}.png"
+        assert cv2.imwrite(str(folder / "SegmentationClass" / file), colours[labels][..., ::-1])
+        if ":" in line:
+            (folder / "SegmentationObject").mkdir(exist_ok=True)
+            assert cv2.imwrite(str(folder / "SegmentationObject" / file), colours[labels] // 2)
+    return folder
+
+
 def without_labels(path):
     """The capture without any label."""
     for file in path.rglob("*.png"):
@@ -153,4 +177,6 @@ EXPORTS = {
     "YOLO of Label Studio": lambda c, out: write_yolo(c, out, label_studio_name),
     "masks": lambda c, out: write_masks(c, out, flat_name),
     "masks of Roboflow": write_masks,
+    "colours of CVAT": lambda c, out: write_colours(c, out, "{}:{},{},{}::"),
+    "colours of simulators": lambda c, out: write_colours(c, out, "{}, {}, {}, {}"),
 }

@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from label_exports import flat_name, write_coco, write_masks, write_yolo
+from label_exports import write_coco, write_colours, write_yolo
 
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.label_import import import_capture
@@ -41,14 +41,14 @@ def one_text(capture, folder):
     return min(write_yolo(capture, folder).glob("train/labels/*.txt"))
 
 
-def segmentation_mask(capture, folder):
-    """As CVAT writes it."""
-    write_masks(capture, folder, flat_name)
-    (folder / "train/_classes.csv").unlink()
-    (folder / "train").rename(folder / "SegmentationClass")
-    (folder / "labelmap.txt").write_text("# label:color_rgb:parts:actions\nbackground:0,0,0::\nbase:250,50,83::\n")
-    (folder / "default.txt").write_text("0000\n0001\n0002\n0003\n0004\n")
-    return folder
+def coloured(text, file="labelmap.txt"):
+    def make(capture, folder):
+        write_colours(capture, folder, "{}:{},{},{}::")
+        (folder / "labelmap.txt").unlink()
+        (folder / file).write_text(text)
+        return folder
+
+    return make
 
 
 def segmentation(value):
@@ -82,7 +82,16 @@ BAD_EXPORTS = {
     "YAML without names": (change_text("data.yaml", "names: 3"), "names is 3"),
     "one text": (one_text, "give the folder that holds data.yaml or classes.txt"),
     "zip": (zipped, "it is a zip; unpack it first"),
-    "masks of colours": (segmentation_mask, "export the labels as COCO 1.0"),
+    "a colour without a name": (coloured("base:200,60,0::"), "0000.png: no class has the colour 0,0,255 of 32 pixels"),
+    "a class without a colour": (
+        coloured("base:200,60::\n"),
+        "line 1 is ['base', '200', '60']; write a class name and",
+    ),
+    "a colour too bright": (
+        coloured("a,0,0,256\nbase,9,9,9", "_classes.csv"),
+        "line 1 is ['a', '0', '0', '256']",
+    ),
+    "a colour of two names": (coloured("a:0,0,1::\nb:0,0,1::\n"), "the colour 0,0,1 is 'a' and, in line 2, 'b'"),
     "nothing": (lambda c, folder: folder, "there are no labels here"),
 }
 

@@ -174,6 +174,22 @@ def test_opaque_images_are_told_from_silhouettes(capture_folder, edit):
     assert ["fill their images" in w for w in found(check_capture(capture_folder)[1], "warning")] == [True]
 
 
+def test_opaque_images_need_labels_that_tell_where_the_object_ends(capture_folder, edit):
+    state = capture_folder / "state_00"
+    for i, file in enumerate(sorted((state / "images").iterdir())):
+        put(file, np.full((16, 16, 3 + i % 2), 255, np.uint8))  # also with an alpha that leaves nothing out
+    assert found(check_capture(capture_folder)[1]) == []
+    relabel(state, 0, 255)
+    assert found(check_capture(capture_folder)[1]) == ["state_00: no labelled frame tells where the object ends"]
+
+    test_frame = cv2.imread(str(state / "labels/0007.png"), cv2.IMREAD_UNCHANGED)
+    put(state / "labels/0007.png", np.where(test_frame == 255, 0, test_frame))  # it is not looked at by a fit
+    assert len(found(check_capture(capture_folder)[1])) == 1
+    edit(capture_folder / FILE, lambda m: m["frames"][0].update(object_mask_path="labels/0001.png"))
+    put(state / "labels/0001.png", np.where(test_frame == 255, 0, 255).astype(np.uint8))
+    assert found(check_capture(capture_folder)[1]) == []
+
+
 def test_masks_that_leave_nothing_to_learn_from_are_an_error(capture_folder, edit):
     put(capture_folder / "state_00/none.png", np.zeros((16, 16), np.uint8))
     edit(capture_folder / FILE, lambda m: [frame.update(mask_path="none.png") for frame in m["frames"]])

@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from small_capture import looking_at_origin
 
 from splatart_ns.capture.check import check_capture
 from splatart_ns.capture.digest import capture_digest
@@ -65,6 +66,27 @@ def labelled_once(labels):
     return np.where(labels == 2, 255, labels).astype(np.uint8)
 
 
+def copy_state(capture):
+    shutil.rmtree(capture / "state_01")
+    shutil.copytree(capture / "state_00", capture / "state_01")
+
+
+def opaque_images(capture):
+    for state in ("state_00", "state_01"):
+        change_json(
+            capture / state / "transforms.json",
+            lambda meta: [frame.pop("object_mask_path") for frame in meta["frames"]],
+        )
+        change_all(capture / state / "images", lambda image: image[..., :3])
+
+
+def unlabelled_surroundings(capture):
+    """But for a few of its pixels, so that no frame has a silhouette."""
+    rows = np.arange(64)[:, None] > 0
+    for state in ("state_00", "state_01"):
+        change_all(capture / state / "semantics", lambda labels: np.where((labels == 0) & rows, 255, labels))
+
+
 LABELS = "state_01/semantics/0005.png"
 MASK = "state_01/masks/0005.png"
 DEFECTS = {
@@ -123,8 +145,12 @@ DEFECTS = {
         {"state_01": "parts measure 0."},
     ),
     "no motion": (
-        lambda c: [shutil.rmtree(c / "state_01"), shutil.copytree(c / "state_00", c / "state_01")],
+        lambda c: [copy_state(c), change_all(c / "state_01/images", lambda image: image // 2 * 2)],
         {"state_01": "no part seems to have moved since state_00"},
+    ),
+    "a state that is a copy": (
+        lambda c: [copy_state(c), opaque_images(c), unlabelled_surroundings(c)],
+        {"state_01": "it shows the same images as state_00"},
     ),
 }
 
@@ -196,15 +222,34 @@ def test_a_few_labelled_neighbours_do_not_make_states_seem_to_have_other_worlds(
 
 
 def test_silhouettes_may_come_from_the_labels(capture):
-    for state in ("state_00", "state_01"):
-        change_json(
-            capture / state / "transforms.json",
-            lambda meta: [frame.pop("object_mask_path") for frame in meta["frames"]],
-        )
-        change_all(capture / state / "images", lambda image: image[..., :3])
+    opaque_images(capture)
     assert examine(capture).problems == ()
     change_png(capture / LABELS, lambda labels: np.roll(labels, 6, axis=1))
-    assert [p.file.name for p in examine(capture).problems] == ["0005.png"]
+    examination = examine(capture)
+    (problem,) = examination.problems
+    assert (problem.file, problem.mend) == (capture / LABELS, "correct its pose or its labels, or take the frame out")
+    assert problem.message.startswith("the outline of the labels of images/0005.png does not fit")
+    assert [(c.frames, c.labelled) for c in examination.coverage] == [(12, 12)] * 4
+
+
+def test_few_silhouettes_most_of_which_do_not_fit_are_one_problem(capture):
+    unlabel(capture, "state_01", range(3, 12))
+    opaque_images(capture)
+    change_poses(capture / "state_01", lambda T: looking_at_origin(0.02 * np.arctan2(T[1, 3], T[0, 3]), distance=1.0))
+    (problem,) = [p for p in examine(capture).problems if "not fit" in p.message]
+    assert problem.file == capture / "state_01"
+
+
+def test_a_state_with_cameras_on_one_spot_is_told_so_and_not_judged_otherwise(capture):
+    change_poses(capture / "state_01", lambda T: looking_at_origin(0.5))
+    examination = examine(capture)
+    assert [p.message for p in examination.problems] == ["all training cameras stand on one spot"]
+    assert [(c.frames, c.labelled) for c in examination.coverage] == [(12, 12)] * 4
+
+
+def test_states_may_be_of_utterly_different_scales(capture):
+    change_poses(capture / "state_01", lambda T: np.block([[T[:3, :3], 1e-7 * T[:3, 3:]], [T[3:]]]))
+    assert examine(capture).problems
 
 
 def test_the_frame_that_shows_what_no_labelled_frame_shows_is_suggested(capture):

@@ -54,12 +54,13 @@ def test_jpeg_is_read(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("keep", [0, 3, 30, 0.5, -1])
-def test_a_cut_off_image_is_an_input_error(tmp_path, suffix, keep):
+def test_a_cut_off_image_is_an_input_error_and_no_more_is_written(tmp_path, capfd, suffix, keep):
     path = write(tmp_path / f"a{suffix}", RNG.integers(0, 255, (32, 32, 3), dtype=np.uint8))
     data = path.read_bytes()
     path.write_bytes(data[: int(keep * len(data)) if 0 < keep < 1 else keep])
     with pytest.raises(InputError, match=rf"a\{suffix}"):
         read_image(path)
+    assert capfd.readouterr().err == ""
 
 
 def test_a_missing_file_a_folder_and_a_stranger_are_input_errors(tmp_path):

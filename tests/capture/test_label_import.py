@@ -288,15 +288,57 @@ def test_images_without_a_frame_are_told(capture_folder, tmp_path, edit):
     assert import_labels(capture_folder, export).unmatched == ("elsewhere.png",)
 
 
+def test_only_what_belongs_to_a_capture_is_copied(capture_folder, paris_folder, tmp_path, edit):
+    state = capture_folder / "state_00"
+    for name in ("depth/0.npy", "depth/1.npy", "images_2/0000.png", "colmap/database.db", "sparse.ply", "raw.mp4"):
+        (state / name).parent.mkdir(exist_ok=True)
+        (state / name).write_bytes(b"x")
+    shutil.copytree(capture_folder / "state_01", capture_folder / "eval/novel_00")
+    (capture_folder / "ground_truth.json").write_text("{}")
+    (capture_folder / "ground_truth_points").mkdir()
+    (capture_folder / "ground_truth_points/part_1.ply").write_text("x")
+    os.symlink("../depth/1.npy", state / "images/deep.npy")
+
+    def name_some(meta):
+        meta["ply_file_path"] = "sparse.ply"
+        meta["frames"][0]["depth_file_path"] = f"{state}/depth/0.npy"
+        meta["frames"][1]["depth_file_path"] = "images/deep.npy"
+        meta["frames"][2]["depth_file_path"] = "depth/missing.npy"
+
+    edit(state / "transforms.json", name_some)
+
+    def files(folder):
+        return {f.relative_to(folder).as_posix() for f in folder.rglob("*") if f.is_file()}
+
+    left = {f"state_00/{name}" for name in ("depth/1.npy", "images_2/0000.png", "colmap/database.db", "raw.mp4")}
+    import_capture([capture_folder], tmp_path / "new", write_export(capture_folder, tmp_path))
+    new = tmp_path / "new"
+    assert {f for f in files(new) if "semantics" not in f} == files(capture_folder) - left
+    assert not (new / "state_00/colmap").exists()
+    import_capture([state, capture_folder / "state_01"], tmp_path / "states")
+    own = {f for f in files(capture_folder) - left if f.startswith("state_")}
+    assert files(tmp_path / "states") == own
+
+    (paris_folder / "notes.txt").write_text("x")
+    import_capture([paris_folder], tmp_path / "paris_new", write_export(paris_folder, tmp_path / "p"))
+    assert files(paris_folder) <= files(tmp_path / "paris_new")
+
+
 def test_links_out_of_a_source_are_not_followed(capture_folder, tmp_path):
     (tmp_path / "secret.png").write_bytes(b"secret")
     os.symlink(tmp_path / "secret.png", capture_folder / "secret.png")
     os.symlink("/", capture_folder / "root")
-    os.symlink("images/0001.png", capture_folder / "state_00/inside.png")
+    (capture_folder / "state_00/images/0001.png").rename(capture_folder / "state_00/image.png")
+    os.symlink("../image.png", capture_folder / "state_00/images/0001.png")
+    novel = capture_folder / "eval/novel_00"
+    novel.mkdir(parents=True)
+    os.symlink(tmp_path / "secret.png", novel / "secret.png")
+    (novel / "transforms.json").write_text(json.dumps({"frames": [{"file_path": "secret.png"}, {"file_path": "\0"}]}))
     os.mkfifo(capture_folder / "pipe")
     import_capture([capture_folder], tmp_path / "new", write_export(capture_folder, tmp_path))
-    assert {f.name for f in (tmp_path / "new").iterdir()} == {"state_00", "state_01"}
-    assert (tmp_path / "new/state_00/inside.png").read_bytes().startswith(b"\x89PNG")
+    assert {f.name for f in (tmp_path / "new").iterdir()} == {"state_00", "state_01", "eval"}
+    assert (tmp_path / "new/state_00/images/0001.png").read_bytes().startswith(b"\x89PNG")
+    assert [f.name for f in (tmp_path / "new/eval/novel_00").iterdir()] == ["transforms.json"]
 
 
 def test_labels_are_not_written_through_a_link_out_of_the_capture(capture_folder, tmp_path):
