@@ -146,11 +146,14 @@ def infer_tree(
         contacts |= find_contacts(points, motions, {_pair(*edge) for edge in slides}, known)
     groups = _free_groups(points, motions, joints, contacts, root, radius, required)
     contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups}, known)
-    tree = build_tree(sorted(points), joints | groups, contacts, root, radius, required, names)
+    tree = build_tree(sorted(points), joints | groups, contacts, root, radius, required)
     reached = reached_from([(j.parent, j.child) for j in tree.joints if (j.parent, j.child) not in groups], root)
-    reasons = {base: why_unattached(base, reached, joints, radius, names) for _, base in groups}
-    reasons = tree.unattached | reasons
-    reasons = {p: why + exchange_hint(p, points, motions, names) for p, why in reasons.items()}
+    carried = {root, *(j.child for j in tree.joints if (j.parent, j.child) not in groups)}
+    apart = {pair: contacts[pair].gap for pair in far}
+    reasons = {
+        p: why_unattached(p, reached, joints, apart, radius, names) + exchange_hint(p, points, motions, names)
+        for p in sorted(set(points) - carried)
+    }
     tree = replace(tree, unattached=reasons, contradicted=contradicted)
     if method == "descent":  # its fits have no scores
         return replace(tree, joints=[replace(j, other=None) for j in tree.joints])
@@ -244,15 +247,13 @@ def build_tree(
     root: int,
     object_radius: float,
     required: Mapping[int, int] | None = None,
-    names: Mapping[int, str] | None = None,
 ) -> KinematicTree:
     """The spanning tree of least total cost from `root` over the accepted joints.
 
     `joints` by (parent, child), both ways round; `contacts` of the accepted ones by (a, b), a < b; `required`: parents
-    by child that the tree must have; `names`: what the reasons of parts that hang on nothing call the parts.
+    by child that the tree must have.
     """
     required = required or {}
-    names = names or _numbered(part_ids)
     graph = {}
     for (parent, child), fit in joints.items():
         if fit.accepted:
@@ -282,8 +283,7 @@ def build_tree(
     rest.sort(key=lambda j: j.cost)
     loops = [j for j in rest if _closes_loop(tree, j, contacts[_pair(j.parent, j.child)], object_radius)]
     rejected = [j for j in rest if j not in loops]
-    unattached = {p: why_unattached(p, reached, joints, object_radius, names) for p in part_ids if p not in reached}
-    return replace(tree, loops=loops, rejected=rejected, unattached=unattached)
+    return replace(tree, loops=loops, rejected=rejected)
 
 
 def _other_parents(
