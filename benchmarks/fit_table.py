@@ -10,7 +10,7 @@ COLUMNS = ("axis\ndeg", "turn\ndeg", "slide\n% R", "right", "PSNR\ndB", "part\nI
 def figures(metrics: dict) -> list[str]:
     """A bundle's metrics.json in these columns: means over the joints; "right" have the right type and parent."""
     joints = metrics["joints"]
-    right = sum(j["type_correct"] and j["parent_correct"] for j in joints)
+    right = sum(bool(j["type_correct"] and j["parent_correct"]) for j in joints)
     views = [v for name, v in metrics["images"].items() if name.startswith("state")]
     return [
         mean([j["axis_angle"] for j in joints]),

@@ -359,7 +359,7 @@ def figures(truth: GroundTruth, bundle: Bundle, shown: Mapping[int, list[int]]) 
 
     return {
         "tree": all(j["parent_correct"] for j in joints),
-        "types": f"{sum(j['type_correct'] for j in joints)} of {len(joints)}",
+        "types": f"{sum(bool(j['type_correct']) for j in joints)} of {len(joints)}",
         "axis": worst([j["axis_angle"] for j in joints]),
         "line": worst([None if j["axis_position"] is None else j["axis_position"] / truth.radius for j in joints]),
         "turn": worst([m[0] for m in motions]),

@@ -97,7 +97,8 @@ def joint_errors(truth: TrueJoint, ground_truth: GroundTruth, bundle: Bundle) ->
 
     The estimated joint between the true pair of parts counts, in either direction. If the child hangs on another
     part instead, there is no axis to compare: the motion errors then come from the estimated motions of the true
-    pair. If the child or its parent is unknown, or the child hangs on nothing, all errors are null.
+    pair. If the child or its parent is unknown, or the child hangs on nothing, all errors are null; so is whether type
+    and parent are correct if one of them has no geometry.
     """
     names = {part.id: part.name for part in bundle.parts}
     parent, child = names.get(truth.parent), names.get(truth.child)
@@ -111,7 +112,10 @@ def joint_errors(truth: TrueJoint, ground_truth: GroundTruth, bundle: Bundle) ->
         "covered_95": None,
     }
     if truth.parent is None or truth.child is None:
-        return record, "a part of it has no geometry, so no image shows it"
+        return record | {
+            "type_correct": None,
+            "parent_correct": None,
+        }, "a part of it has no geometry, so no image shows it"
     if parent is None or child is None:
         return record, "the estimate lacks a part of this joint"
     joint = find_joint(bundle, parent, child)

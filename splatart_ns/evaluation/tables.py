@@ -33,14 +33,16 @@ _HELD_OUT_COLUMNS = {
     "part_iou": "part IoU\n",
 }
 _CHAMFER_COLUMNS = {"CD-s": "CD-s", "CD-m": "CD-m", "CD-w": "CD-w"}
+_PARENTS = {True: "", False: " (wrong parent)", None: " (not comparable)"}
+"""What is said of a joint by its `parent_correct`."""
 
 
 def format_tables(metrics: dict[str, Any]) -> list[Table | Text]:
     """Everything in `metrics` for rich to print, one item after the other; tables without rows are left out."""
     joints = [
         (
-            f"{j['child']}{'' if j['parent_correct'] else ' (wrong parent)'}",
-            f"{j['type']}{'' if j['type_correct'] else ' (wrong)'}",
+            f"{j['child']}{_PARENTS[j['parent_correct']]}",
+            f"{j['type']}{' (wrong)' if j['type_correct'] is False else ''}",
             j,
         )
         for j in metrics["joints"]

@@ -33,6 +33,7 @@ from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.flush import border_against_others
 from splatart_ns.stages.merge import merge_parts
+from splatart_ns.stages.motion_preference import OTHERWISE
 from splatart_ns.stages.neighbours import turned_as_neighbours_let
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.reference import is_sure, reference_states, refine_known_poses, since_state_0
@@ -191,6 +192,7 @@ class PosePipeline(StagePipeline):
         S, P = len(splats), self.model.num_parts
         self._reference, self._known, self._frozen = [0] * P, torch.ones(S, P, dtype=torch.bool), torch.zeros(S, P) > 0
         self._maybe_moved = torch.zeros(S, P) > 0
+        self._alike: dict[tuple[int, int], InitialMotion] = {}  # by state and part
         self.model.start(splats, self._initial_poses(splats), self._frozen)
         # Gaussians learn labels that somebody gave: by those that they showed themselves, images come out worse.
         to_learn = [
@@ -256,19 +258,40 @@ class PosePipeline(StagePipeline):
                 still = motion.still and not (motion.maybe_moved and part in moves)
                 self._frozen[s, p] = not motion.found or (snap and still)
                 self._maybe_moved[s, p] = motion.maybe_moved
-                self.model.alike[p] |= len(motion.alike) > 0
-                self._note_alike(p, s, motion)
+                if motion.alike:
+                    self._alike[s, p] = motion
         return since_state_0(M, self._known)
 
-    def _note_alike(self, p: int, s: int, motion: InitialMotion) -> None:
-        """Say by which other turns the images show a part as well."""
-        if motion.alike:
-            turn, *others = (round(math.degrees(so3_log(T[:3, :3]).norm())) for T in (motion.T, *motion.alike))
+    def _note_alike(self, T: Tensor, covariance: Tensor) -> None:
+        """Say by which turns other than those of the poses T [S, P, 4, 4] the images show a part as well, and mark it
+        for `doubted`.
+
+        Of those whose covariances [S, P, 6, 6] leave the turn open, `_note_turned` says enough.
+        """
+        open_turns = may_have_turned(covariance)
+        for (s, p), motion in self._alike.items():
+            found = (T[s, p] @ inverse(T[self._reference[p], p])).to(motion.T)
+            # The turn that the search ended at is another one where refinement left it.
+            others = [
+                round(math.degrees(so3_log(X[:3, :3]).norm()))
+                for X in (*motion.alike, motion.T)
+                if so3_log(found[:3, :3].mT @ X[:3, :3]).norm() > OTHERWISE / 2
+            ]
+            if not others:
+                continue
+            self.model.alike[p] = True
+            if open_turns[s, p]:
+                continue
             others = list(dict.fromkeys(others))
             few = " or ".join(map(str, others))
             by = few if len(others) <= FEW else f"{len(others)} others of {min(others)} to {max(others)}"
+            turn = round(math.degrees(so3_log(found[:3, :3]).norm()))
+            rests = torch.allclose(found, torch.eye(4).to(found))
+            how = f"turned by {turn} degrees; by {by}"
+            if not turn:
+                how = f"{'rests' if rests else 'slid'}; turned by {by} degrees"
             part = f"part {self.model.part_names[p + 1]}, state {s}"
-            self.notes.append(f"{part}: turned by {turn} degrees; by {by} it looks nearly the same.")
+            self.notes.append(f"{part}: {how} it looks nearly the same.")
             CONSOLE.log(self.notes[-1], markup=False)
 
     def _note_resting(self, held: Tensor, T: Tensor, covariance: Tensor) -> None:
@@ -434,6 +457,7 @@ class PosePipeline(StagePipeline):
         known = model.covariance.isfinite().flatten(2).all(-1)
         self._note_unknown(known)
         self._note_turned(model.covariance)
+        self._note_alike(T, model.covariance)
         self._note_resting(begun, T, model.covariance)
         merged = Splat.cat(merge_parts(splats, self.views, T, known, self._seen if as_begun else None))
         params = gauss_params_from_splat(merged)

@@ -342,10 +342,12 @@ class SemanticPipeline(StagePipeline):
         self.findings["cameras"] = {**asdict(change), "pixels": shift, "slack_pixels": [before, now]}
         moved = f"turned by {change.degrees:.2f} deg and moved by {change.percent:.2f} % of their distance"
         if 0 < before <= now:
-            why = (
-                f"contradict each other by {now} pixels, and refining them did not help: they were {moved}; check "
-                "poses, intrinsics and masks"
-            )
+            why = f"contradict each other by {now} pixels, and refining them did not help: they were {moved}"
+            if shift < EXACT_PIXELS:  # silhouettes have gaps where such parts are
+                why += f", {shift:.1f} pixels in the images; if no part is thinner than a pixel, as cables are,"
+            else:
+                why += ";"
+            why += " check poses, intrinsics and masks"
         elif before > 0:
             why = f"contradicted each other by {before} pixels; they were {moved}, and now do so by {now}"
         else:

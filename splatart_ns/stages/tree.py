@@ -14,7 +14,7 @@ why. If other parts hang on it, a free joint carries the group, so that the join
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -50,7 +50,8 @@ hinge whose axis its parent and the child itself turn about on the root, as door
 that the other two do not, and a drawer shows where it nears its neighbour but not where it touches the body. And that
 of a part that is nearly fixed to such a one, but not quite: both moved by about as much. And that of a slide between
 two parts that turn about parallel lines on the root: from one state to another by the same angle. And that of two that
-rest on the root, but may have turned, as knobs beside each other: what is behind them nobody sees."""
+rest on the root, but may have turned, as knobs beside each other: what is behind them nobody sees. And that of a slide
+on a part that rests on the root: a closed drawer is nearer to the one below it than what is seen of the body."""
 _NOT_QUITE, _OF_MOTION = 0.002, 0.15
 """Least residual of such a fixed joint, as a share of the object's radius: a handle's on its door is as small as the
 errors of poses are; of two of a desk's seven drawers it was 0.0028. Or as a share of what a fixed joint to the root
@@ -66,7 +67,8 @@ it: of a stapler's three parts about one pin, that in the middle turned by less 
 _CLOSE_CALL = 0.02
 """How much more the cheapest tree may cost that hangs a part on another one, where that is said to be as likely.
 Measured on 387 joints of robots, models and random objects: so it is of 10 of 20 that have a wrong parent, all but two
-of which have their true one in that other tree, and of 14 of the 367 others."""
+of which have their true one in that other tree, and of 14 of the 367 others. Where the two parents stay together only
+contact tells them apart, so that as much as `_STACKED_ALIKE` is close."""
 _APART = 0.4
 """Parts that come apart by more than this share of the object's radius are not joined, unless the user says so: parts
 that are came apart by 0.12 at most (of 387 joints); a chair's seat, which turned and slid, fitted hinges on two wheels
@@ -146,11 +148,14 @@ def infer_tree(
         contacts |= find_contacts(points, motions, {_pair(*edge) for edge in slides}, known)
     groups = _free_groups(points, motions, joints, contacts, root, radius, required)
     contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups}, known)
-    tree = build_tree(sorted(points), joints | groups, contacts, root, radius, required, names)
+    tree = build_tree(sorted(points), joints | groups, contacts, root, radius, required)
     reached = reached_from([(j.parent, j.child) for j in tree.joints if (j.parent, j.child) not in groups], root)
-    reasons = {base: why_unattached(base, reached, joints, radius, names) for _, base in groups}
-    reasons = tree.unattached | reasons
-    reasons = {p: why + exchange_hint(p, points, motions, names) for p, why in reasons.items()}
+    carried = {root, *(j.child for j in tree.joints if (j.parent, j.child) not in groups)}
+    apart = {pair: contacts[pair].gap for pair in far}
+    reasons = {
+        p: why_unattached(p, reached, joints, apart, radius, names) + exchange_hint(p, points, motions, names)
+        for p in sorted(set(points) - carried)
+    }
     tree = replace(tree, unattached=reasons, contradicted=contradicted)
     if method == "descent":  # its fits have no scores
         return replace(tree, joints=[replace(j, other=None) for j in tree.joints])
@@ -244,15 +249,13 @@ def build_tree(
     root: int,
     object_radius: float,
     required: Mapping[int, int] | None = None,
-    names: Mapping[int, str] | None = None,
 ) -> KinematicTree:
     """The spanning tree of least total cost from `root` over the accepted joints.
 
     `joints` by (parent, child), both ways round; `contacts` of the accepted ones by (a, b), a < b; `required`: parents
-    by child that the tree must have; `names`: what the reasons of parts that hang on nothing call the parts.
+    by child that the tree must have.
     """
     required = required or {}
-    names = names or _numbered(part_ids)
     graph = {}
     for (parent, child), fit in joints.items():
         if fit.accepted:
@@ -267,7 +270,7 @@ def build_tree(
         joint = min(open_edges, key=lambda j: j.cost)
         chosen.append(joint)
         reached.add(joint.child)
-    others = _other_parents(allowed, parents, root)
+    others = _other_parents(allowed, parents, root, {edge for edge, fit in joints.items() if fit.type == "fixed"})
     chosen = [replace(j, other=graph[others[j.child], j.child]) if j.child in others else j for j in chosen]
 
     tree = KinematicTree(list(part_ids), root, chosen)
@@ -282,17 +285,24 @@ def build_tree(
     rest.sort(key=lambda j: j.cost)
     loops = [j for j in rest if _closes_loop(tree, j, contacts[_pair(j.parent, j.child)], object_radius)]
     rejected = [j for j in rest if j not in loops]
-    unattached = {p: why_unattached(p, reached, joints, object_radius, names) for p in part_ids if p not in reached}
-    return replace(tree, loops=loops, rejected=rejected, unattached=unattached)
+    return replace(tree, loops=loops, rejected=rejected)
 
 
-def _other_parents(costs: Mapping[tuple[int, int], float], parents: Mapping[int, int], root: int) -> dict[int, int]:
-    """By child: its parent in the cheapest tree that hangs it on another one, where that tree costs hardly more."""
+def _other_parents(
+    costs: Mapping[tuple[int, int], float], parents: Mapping[int, int], root: int, fixed: Set[tuple[int, int]]
+) -> dict[int, int]:
+    """By child: its parent in the cheapest tree that hangs it on another one, where that tree costs hardly more.
+
+    `fixed`: pairs of parts, either way round, that stay together.
+    """
     least, others = sum(costs[a, b] for b, a in parents.items()), {}
     for b, a in parents.items():
         elsewhere = cheapest_parents({edge: cost for edge, cost in costs.items() if edge != (a, b)}, root)
         cost = sum(costs[parent, child] for child, parent in elsewhere.items())
-        if elsewhere.keys() == parents.keys() and cost - least < _CLOSE_CALL:
+        if elsewhere.keys() != parents.keys():
+            continue
+        moves_alike = (a, elsewhere[b]) in fixed and (a, b) not in fixed
+        if cost - least < (_STACKED_ALIKE if moves_alike else _CLOSE_CALL):
             others[b] = elsewhere[b]
     return others
 
@@ -354,6 +364,8 @@ def _stacked(
         fits = on_root
     kinds = {fit.type for fit in fits}
     if kinds == {"fixed"} and all(fit.ambiguous for fit in on_root):
+        return _STACKED_ALIKE
+    if [fit.type for fit in fits] == ["prismatic", "fixed", "prismatic"]:
         return _STACKED_ALIKE
     if kinds not in ({"prismatic"}, {"revolute"}):
         return _STACKED

@@ -14,16 +14,28 @@ def why_unattached(
     part: int,
     reached: set[int],
     joints: Mapping[tuple[int, int], JointFit],
+    apart: Mapping[tuple[int, int], float],
     object_radius: float,
     names: Mapping[int, str],
 ) -> str:
-    """Of a part that none of the `joints` by (parent, child) explains on a part of the tree, those `reached`."""
+    """Of a part that none of the `joints` by (parent, child) explains on a part of the tree, those `reached`.
+
+    `apart`: the gaps (length) of pairs that move as by a joint, but are too far from each other for one.
+    """
     # Either way round, as the parts' points differ; what one leaves may be within the limit.
     tried = [
         (max(fit.residual, joints.get((c, p), fit).residual) / object_radius, p, fit.type)
         for (p, c), fit in joints.items()
         if c == part and p in reached
     ]
+    gaps = [(gap, p) for pair, gap in apart.items() if part in pair for p in reached.intersection(pair)]
+    if gaps and not tried:
+        gap, parent = min(gaps)
+        told = f"--joint '{names[part]}:{names[parent]}'"
+        return (
+            f"{names[part]} moves as by a joint on {names[parent]}, but is {gap / object_radius:.0%} of the object's "
+            f"radius away from it: {told} hangs it there."
+        )
     if not tried:
         return f"No joint was fitted between {names[part]} and any part of the tree."
     residual, parent, kind = min(tried)

@@ -138,3 +138,10 @@ def test_names_are_not_read_as_markup(bundle, folder, capture):
     metrics["notes"] = ["[bold]x"]
     text = printed(metrics)
     assert "[red]door (wrong parent)" in text and "(wrong)" in text and "[bold]x" in text
+
+
+def test_joints_of_parts_without_geometry_are_shown_as_not_comparable_and_not_as_wrong(folder, capture):
+    metrics = evaluate(folder, capture)
+    metrics["joints"][0] |= {"child": "cap", "parent_correct": None, "type_correct": None}
+    text = printed(metrics)
+    assert "cap (not comparable)" in text and "wrong" not in text

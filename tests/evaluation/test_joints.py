@@ -174,6 +174,7 @@ def test_a_missing_part_has_null_errors(truth, bundle):
 def test_a_joint_of_a_part_without_geometry_has_null_errors(truth, bundle):
     record, note = joint_errors(replace(truth.joints[1], parent=None), truth, bundle)
     assert "no geometry" in note
+    assert record["type_correct"] is None and record["parent_correct"] is None
     assert (record["child"], record["parent"], record["displacement"]) == ("latch", "door", None)
 
 

@@ -330,18 +330,37 @@ def test_a_part_is_not_shown_in_a_state_where_its_pose_is_not_known(pose_trainer
 
 
 @pytest.mark.parametrize(
-    ("turns", "by"),
+    ("found", "searched", "told"),
     [
-        ((30, 150), "by 150 it"),
-        ((30, 150, 90, 150), "by 150 or 90 it"),
-        ((30, 90, 100, 110, 120, 80), "by 5 others of 80 to 120 it"),
+        (30, (30, 150), "turned by 30 degrees; by 150"),
+        (30, (30, 150, 90, 150), "turned by 30 degrees; by 150 or 90"),
+        (30, (30, 90, 100, 110, 120, 80), "turned by 30 degrees; by 5 others of 80 to 120"),
+        (0, (28, 151), "slid; turned by 151 degrees"),
+        (90, (0, 80, 150), "turned by 90 degrees; by 150 or 0"),
+        (25, (0, 32), None),
     ],
 )
-def test_turns_that_look_alike_are_noted_all_if_they_are_few(pose_trainer, turns, by):
+def test_turns_other_than_the_one_found_that_look_alike_are_noted_all_if_they_are_few(
+    pose_trainer, found, searched, told
+):
+    """The first of those `searched` is where refinement began."""
     pipeline = pose_trainer(init="centroids").pipeline
-    T, *alike = (se3_exp(torch.tensor([0, 0, 0, 0, 0, math.radians(turn)]).double()) for turn in turns)
-    pipeline._note_alike(1, 1, InitialMotion(T, found=True, alike=tuple(alike)))
-    assert pipeline.notes == [f"part lid, state 1: turned by 30 degrees; {by} looks nearly the same."]
+
+    def moved(turn):
+        return se3_exp(torch.tensor([0, 0, 0.1, 0, 0, math.radians(turn)]).double())
+
+    first, *alike = (moved(turn) for turn in searched)
+    pipeline._alike[1, 1] = InitialMotion(first, found=True, alike=tuple(alike))
+    T = torch.eye(4, dtype=torch.float64).repeat(2, 2, 1, 1)
+    T[1, 1] = moved(found)
+    covariance = torch.zeros(2, 2, 6, 6, dtype=torch.float64)
+    pipeline._note_alike(T, covariance)
+    assert pipeline.model.alike.tolist() == [False, told is not None]
+    assert pipeline.notes == ([] if told is None else [f"part lid, state 1: {told} it looks nearly the same."])
+    pipeline.notes.clear()
+    covariance[1, 1, 5, 5] = 4.0
+    pipeline._note_alike(T, covariance)
+    assert not pipeline.notes  # that its turn is not told is said elsewhere
 
 
 def test_a_part_that_may_have_turned_unseen_is_noted(pose_trainer):

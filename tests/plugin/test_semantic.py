@@ -246,6 +246,22 @@ def test_cameras_that_contradict_each_other_as_much_as_before_are_not_called_men
     assert told in pipeline.notes[-1]
 
 
+@pytest.mark.parametrize("pixels", [0.1, 2.0])
+def test_parts_thinner_than_a_pixel_are_named_where_cameras_hardly_moved_and_still_contradict_each_other(
+    capture_dir, semantic_trainer, pixels
+):
+    """A cable's silhouettes have gaps, which are not those of the other views, however exact the cameras are."""
+    pipeline = semantic_trainer(capture_dir).pipeline
+    pipeline.datamanager.slack = pipeline._slack = Slack(pixels=4)
+    viewmats, focal = pipeline._given.clone(), torch.stack([view.K[0, 0] for view in pipeline._views])
+    viewmats[:, 0, 3] += pixels * viewmats[:, 2, 3] / focal
+    pipeline.model.viewmats = viewmats
+    pipeline._note_cameras()
+    note = pipeline.notes[-1]
+    assert note.endswith(" check poses, intrinsics and masks.")
+    assert ("0.1 pixels in the images; if no part is thinner than a pixel, as cables are," in note) == (pixels < 1)
+
+
 @pytest.mark.parametrize("pixels, moved", [(0.3, False), (1.0, True)])
 def test_cameras_of_images_without_silhouettes_move_if_that_is_by_pixels(
     opaque_capture_dir, semantic_trainer, monkeypatch, pixels, moved

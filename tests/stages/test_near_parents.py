@@ -166,3 +166,28 @@ def test_a_part_that_only_one_parent_explains_has_no_other():
     joints, gaps, touching = links((0.01, 0.2, 0.2))
     del joints[1, 3]
     assert other_parents(tree_found(joints, gaps, touching)) == {2: None, 3: None}
+
+
+def beside_one_at_rest(kind, closer):
+    """Part 3 moves against the root and against part 2, which rests on it and is nearer by `closer` radii."""
+    move = JointFit(kind, X, 0 * X, 0.0, torch.tensor([0.0, 0.2]).double(), residual=0.0)
+    still = JointFit("fixed", 0 * X, 0 * X, 0.0, torch.zeros(2).double(), residual=0.0)
+    return tree_found({(1, 2): still, (1, 3): move, (2, 3): move}, {(1, 2): 0.02, (1, 3): 0.17, (2, 3): 0.17 - closer})
+
+
+@pytest.mark.parametrize(
+    "kind, closer, parent, other",
+    [
+        ("prismatic", 0.05, 1, 2),
+        ("prismatic", 0.15, 2, 1),
+        ("prismatic", -0.05, 1, None),
+        ("revolute", 0.01, 1, 2),
+        ("revolute", 0.05, 2, 1),
+        ("revolute", 0.13, 2, None),
+    ],
+)
+def test_a_part_beside_one_at_rest_may_as_well_hang_on_it(kind, closer, parent, other):
+    """As a drawer does on a closed one above it: no motion tells which of the two bears it."""
+    tree = beside_one_at_rest(kind, closer)
+    assert {j.child: j.parent for j in tree.joints} == {2: 1, 3: parent}
+    assert other_parents(tree) == {2: None, 3: other}

@@ -95,6 +95,20 @@ def test_parts_far_apart_are_joined_by_the_user_alone():
     assert edges(infer_tree(points, motions, root=1, constraints=[other])) == {(1, 2)}
 
 
+def test_a_part_that_moves_as_by_a_joint_far_away_is_told_how_to_be_hung_there():
+    """A hook on a cable too thin to be seen."""
+    points = {1: box((0, 0, 0), (0.4, 0.4, 0.4), 1), 2: box((0, 0, -1.2), (0.4, 0.4, 0.4), 2)}
+    truth = KinematicTree([1, 2], 1, [true_joint(1, 2, "prismatic", Z, (0, 0, 0))])
+    motions = motions_of(truth, torch.tensor([[0], [-0.3]], dtype=torch.float64))
+    tree = infer_tree(points, motions, root=1, names={1: "trolley", 2: "hook"})
+    gap = find_contacts(points, motions)[1, 2].gap / object_radius(points)
+    assert not tree.joints and tree.unattached == {
+        2: f"hook moves as by a joint on trolley, but is {gap:.0%} of the object's radius away from it: "
+        "--joint 'hook:trolley' hangs it there."
+    }
+    assert edges(infer_tree(points, motions, root=1, constraints=[JointConstraint(1, 2)])) == {(1, 2)}
+
+
 def drawers(states):
     points = {
         1: torch.cat(

@@ -37,7 +37,10 @@ class Run:
 
 
 def simulate(path: Path) -> Run:
-    """Drive the file's own actuators, one after the other, to the upper limit, to the lower, and back."""
+    """Drive the file's own actuators, one after the other, to the upper limit, to the lower, and back.
+
+    The others hold their joints at 0, but for those around a loop with the one that is driven: they let go.
+    """
     import mujoco
 
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -52,12 +55,17 @@ def simulate(path: Path) -> Run:
     followings = np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT)
     followers, leaders = model.eq_obj1id[followings], model.eq_obj2id[followings]
     factors = model.eq_data[followings, 1]
+    places = model.jnt_qposadr[model.actuator_trnid[:, 0]]
+    lets_go = _around_loops(model)
+    gains, biases = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
     stable, excess, strayed = True, 0.0, 0.0
     for step in range(steps):
         data.ctrl[:] = 0.0
         turn, phase = divmod(step * model.nu / steps, 1.0) if model.nu else (0, 0.0)
         actuator = int(turn)
         if model.nu:
+            holds = ~lets_go[actuator][:, None]
+            model.actuator_gainprm[:], model.actuator_biasprm[:] = holds * gains, holds * biases
             data.ctrl[actuator] = _across(phase, *model.actuator_ctrlrange[actuator])
         mujoco.mj_step(model, data)
         stable &= bool(np.isfinite(data.qpos).all() and np.isfinite(data.qacc).all())
@@ -67,16 +75,39 @@ def simulate(path: Path) -> Run:
         if data.ncon:
             touched |= _contacts(model, data)
         q = data.qpos[limited]  # all joints are of one number
-        excess = max(excess, float((np.maximum(q - high, low - q) / (high - low)).max(initial=0.0)))
+        beyond = np.maximum(q - high, low - q) / (high - low)
+        if model.nu:  # what let go hangs at its limits
+            beyond[np.isin(limited, model.actuator_trnid[lets_go[actuator], 0])] = 0.0
+        excess = max(excess, float(beyond.max(initial=0.0)))
         strayed = max(strayed, float(np.abs(data.qpos[followers] - factors * data.qpos[leaders]).max(initial=0.0)))
         if model.nu:
-            q = data.qpos[model.actuator_trnid[actuator, 0]]
+            q = data.qpos[places[actuator]]
             driven_low[actuator] = min(driven_low[actuator], q)
             driven_high[actuator] = max(driven_high[actuator], q)
     stable &= not any(warning.number for warning in data.warning)
     covered = (driven_high - driven_low) / np.ptp(model.jnt_range[model.actuator_trnid[:, 0]], axis=1)
     slowest = model.actuator(int(covered.argmin())).name if model.nu else ""
     return Run(seconds, stable, excess, strayed, float(covered.min(initial=1.0)), slowest, at_rest, touched)
+
+
+def _around_loops(model) -> np.ndarray:
+    """By actuator, which others [nu, nu] bool move joints of a loop that its own joint belongs to."""
+    import mujoco
+
+    def to_world(body: int) -> set[int]:
+        path = set()
+        while body:
+            path.add(body)
+            body = int(model.body_parentid[body])
+        return path
+
+    moved = model.jnt_bodyid[model.actuator_trnid[:, 0]]
+    together = np.zeros((model.nu, model.nu), dtype=bool)
+    closures = np.isin(model.eq_type, [mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD])
+    for a, b in zip(model.eq_obj1id[closures], model.eq_obj2id[closures], strict=True):
+        inside = np.isin(moved, list(to_world(int(a)) ^ to_world(int(b))))
+        together |= inside[:, None] & inside
+    return together & ~np.eye(model.nu, dtype=bool)
 
 
 def _across(phase: float, low: float, high: float) -> float:
