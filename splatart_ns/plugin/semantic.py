@@ -9,7 +9,7 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
@@ -22,7 +22,6 @@ from splatart_ns.choices import RefineCameras
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
-from splatart_ns.plugin.pipeline import StagePipeline
 from splatart_ns.rasterize.ssim import l1_ssim_loss
 from splatart_ns.stages.camera_refinement import (
     EXACT_PIXELS,
@@ -225,7 +224,7 @@ class SemanticPipelineConfig(VanillaPipelineConfig):
     _target: type = field(default_factory=lambda: SemanticPipeline)
 
 
-class SemanticPipeline(StagePipeline):
+class SemanticPipeline(VanillaPipeline):
     """Lets the second phase see labelled frames only, and starts it from votes."""
 
     def __init__(self, *args, **kwargs):
