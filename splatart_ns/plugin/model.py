@@ -80,6 +80,8 @@ class SplatartModel(SplatfactoModel):
                 "--pipeline.model.color-corrected-metrics is True, but SPLATART's models measure images as they are; "
                 "leave it out: splatart-semantic brings frames to one exposure."
             )
+        if not 0 <= (degree := self.config.sh_degree) <= 3:
+            raise InputError(f"--pipeline.model.sh-degree is {degree}; give 0 to 3.")
         if self.config.rasterizer != "auto":
             set_backend(self.config.rasterizer)
             if self.config.rasterizer == "numba" and torch.device(self.kwargs.get("device", "cpu")).type != "cpu":

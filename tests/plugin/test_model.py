@@ -57,6 +57,12 @@ def test_a_bilateral_grid_is_refused() -> None:
         SplatartModelConfig(use_bilateral_grid=True).setup(scene_box=None, num_train_data=1, metadata={})
 
 
+@pytest.mark.parametrize("degree", [-1, 4])
+def test_spherical_harmonics_of_other_degrees_are_refused(degree: int) -> None:
+    with pytest.raises(InputError, match=f"sh-degree is {degree}; give 0 to 3"):
+        SplatartModelConfig(sh_degree=degree).setup(scene_box=None, num_train_data=1, metadata={})
+
+
 def test_metrics_that_are_not_computed_are_refused() -> None:
     with pytest.raises(InputError, match="color-corrected-metrics is True, .* leave it out"):
         SplatartModelConfig(color_corrected_metrics=True).setup(scene_box=None, num_train_data=1, metadata={})
