@@ -86,6 +86,7 @@ class SemanticModel(SplatartModel):
     """Two phases in one run: all but the logits, then the logits alone."""
 
     config: SemanticModelConfig
+    shows_surroundings = True
 
     def populate_modules(self) -> None:
         super().populate_modules()
