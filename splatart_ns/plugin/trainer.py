@@ -32,8 +32,12 @@ class StageTrainerConfig(TrainerConfig):
         """Write config.yml, which `ns-train` does first of all.
 
         Raises:
-            InputError: for a checkpoint to go on from: what a stage makes of views and cameras on its way is in none.
+            InputError: no capture is given; or a checkpoint to go on from, in which nothing is of what a stage makes of
+                views and cameras on its way.
         """
+        manager = self.pipeline.datamanager
+        if manager.data is None and manager.dataparser.data == Path():  # the parser's default
+            raise InputError("No capture is given; give its folder by --data.")
         if self.load_dir is not None or self.load_checkpoint is not None:
             raise InputError(
                 "A stage is trained as a whole and does not go on from a checkpoint; leave --load-dir and "

@@ -17,10 +17,21 @@ from splatart_ns.method_configs.semantic import method as semantic_method
 def test_a_checkpoint_to_go_on_from_is_refused_before_a_config_is_written(tmp_path, method, option):
     config = copy.deepcopy(method.config)
     config.output_dir, config.timestamp = tmp_path / "outputs", "run"
+    config.pipeline.datamanager.data = tmp_path
     setattr(config, option, tmp_path)
     with pytest.raises(InputError, match="leave --load-dir and --load-checkpoint out"):
         config.save_config()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_without_a_capture_is_refused_before_its_folder_is_made(tmp_path):
+    config = copy.deepcopy(semantic_method.config)
+    config.output_dir, config.timestamp = tmp_path / "outputs", "run"
+    with pytest.raises(InputError, match="give its folder by --data"):
+        config.save_config()
+    assert list(tmp_path.iterdir()) == []
+    config.pipeline.datamanager.dataparser.data = tmp_path
+    config.save_config()
 
 
 @pytest.mark.parametrize("method", [pose_method, joint_method], ids=lambda m: m.config.method_name)
