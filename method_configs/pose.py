@@ -3,13 +3,13 @@
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
-from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from splatart_ns.plugin.compat import FusedAdamOptimizerConfig
 from splatart_ns.plugin.datamanager import SplatartDatamanagerConfig
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.plugin.pose import PoseModelConfig, PosePipelineConfig
+from splatart_ns.plugin.trainer import StageTrainerConfig
 
 DESCENT_STEPS = 200
 MERGE_STEPS = 400
@@ -21,7 +21,7 @@ def _adam(lr: float) -> dict:
 
 
 method = MethodSpecification(
-    config=TrainerConfig(
+    config=StageTrainerConfig(
         method_name="splatart-pose",
         steps_per_save=2000,
         steps_per_eval_batch=0,

@@ -3,13 +3,13 @@
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
-from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from splatart_ns.plugin.compat import FusedAdamOptimizerConfig
 from splatart_ns.plugin.datamanager import SplatartDatamanagerConfig
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.plugin.semantic import SemanticModelConfig, SemanticPipelineConfig
+from splatart_ns.plugin.trainer import StageTrainerConfig
 
 STEPS = 1000
 PART_STEPS = 100
@@ -21,7 +21,7 @@ def _adam(lr: float, final: float | None = None) -> dict:
 
 
 method = MethodSpecification(
-    config=TrainerConfig(
+    config=StageTrainerConfig(
         method_name="splatart-semantic",
         steps_per_save=2000,
         steps_per_eval_batch=0,

@@ -3,6 +3,7 @@
 import importlib.metadata
 import json
 import shutil
+from pathlib import Path
 
 import imageio
 import numpy as np
@@ -248,6 +249,22 @@ def test_render_looks_through_a_camera_of_the_capture(run_main, hinge_fit, hinge
     true = alpha * rgba[..., :3] + (1 - alpha) * 255
     assert shown.shape == true.shape
     assert -10 * np.log10(((shown - true) ** 2).mean() / 255**2) > 18
+
+
+def test_render_looks_through_a_camera_as_it_took_its_image(run_main, hinge_fit, hinge_capture, tmp_path):
+    capture = shutil.copytree(hinge_capture, tmp_path / "capture")
+    file = capture / "state_01/transforms.json"
+    meta = json.loads(file.read_text())
+    file.write_text(json.dumps(meta | {"k1": -0.2}))
+    name = Path(meta["frames"][3]["file_path"]).name
+    pictures = []
+    for data in (hinge_capture, capture):
+        arguments = ("--data", data, "--state", "state_01", "--camera", name)
+        assert run_main("render", hinge_fit, "--output", tmp_path / "frames", *arguments)[0] == 0
+        pictures.append(picture(tmp_path / "frames/frame_0000.png"))
+    assert pictures[0].shape == pictures[1].shape == picture(capture / "state_01/images" / name)[..., :3].shape
+    covered = [(shown.min(-1) < 200).sum() for shown in pictures]
+    assert 0.8 * covered[0] < covered[1] < covered[0]  # it is drawn towards the centre
 
 
 def test_a_dataset_is_a_capture_without_problems(run_main, hinge_fit, tmp_path):

@@ -1,9 +1,14 @@
 """`splatart fit`: what it leaves, and that it goes on where it was ended."""
 
+import errno
+import fcntl
 import json
 import math
+import os
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from dataclasses import replace
 
@@ -14,6 +19,8 @@ import torch
 
 from splatart_ns.bundle import load_bundle
 from splatart_ns.bundle.export.folder import export_folder
+from splatart_ns.errors import InputError
+from splatart_ns.plugin.fit_lock import alone_in
 
 STAGES = ["semantic state_00", "semantic state_01", "pose", "joint"]
 RUNS = ["state_00/splatart-semantic", "state_01/splatart-semantic", "all/splatart-pose", "all/splatart-joint"]
@@ -233,6 +240,45 @@ def test_a_fit_says_first_what_check_warns_of(hinge_capture, tmp_path, monkeypat
     assert "And 1 more warnings, see `splatart check" in told
 
 
+def test_a_second_fit_in_a_folder_is_refused_while_the_first_one_runs(hinge_capture, tmp_path, monkeypatch, run_main):
+    from splatart_ns.plugin import fit as fits
+
+    arguments = ("fit", hinge_capture, "--output-dir", tmp_path / "bundle")
+    said = []
+
+    def train(*_, **__):
+        said.append(run_main(*arguments))
+
+    monkeypatch.setattr(fits, "_train", train)
+    assert run_main(*arguments)[0] == 0
+    assert len(said) == 3  # stages, each of which was the first fit's
+    for code, _, errors in said:
+        assert code == 2 and "another fit is at work there" in errors and errors.count("\n") == 1
+    assert [path.name for path in (tmp_path / "bundle").iterdir()] == ["runs"]
+
+
+def test_a_fit_that_was_killed_leaves_no_lock(tmp_path):
+    code = (
+        "import os, pathlib, signal\n"
+        "from splatart_ns.plugin.fit_lock import alone_in\n"
+        f"with alone_in(pathlib.Path({str(tmp_path)!r})):\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGKILL
+    with alone_in(tmp_path):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_fit_goes_on_where_the_file_system_has_no_locks(tmp_path, monkeypatch):
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with alone_in(tmp_path), alone_in(tmp_path):
+        pass
+
+
 class TestResuming:
     """What of an earlier run counts."""
 
@@ -280,6 +326,18 @@ class TestResuming:
         image = cv2.imread(str(labels), cv2.IMREAD_UNCHANGED)
         assert cv2.imwrite(str(labels), np.where(image == 2, 0, image).astype(np.uint8))
         assert not report(fit_copy, changed).resume(STAGES[0], whole=True)
+
+    def test_a_fit_of_another_capture_is_refused(self, report, fit_copy, hinge_capture):
+        def moved(told):
+            told["capture"] = "/elsewhere"
+
+        change_json(fit_copy / "report.json", moved)
+        assert not report(fit_copy, hinge_capture).resume(STAGES[0], whole=True)
+        change_json(fit_copy / "report.json", lambda told: (moved(told), told.update(capture_sha256="0")))
+        before = contents(fit_copy)
+        with pytest.raises(InputError, match="bundle holds a fit of /elsewhere; choose another --output-dir"):
+            report(fit_copy, hinge_capture)
+        assert contents(fit_copy) == before
 
     def test_none_after_one_that_is_done_again(self, report, fit_copy, hinge_capture):
         again = report(fit_copy, hinge_capture)

@@ -161,7 +161,10 @@ def orbit_camera(
 
 
 def capture_camera(capture: Capture, index: int) -> Camera:
-    """The camera of a frame of the first state, without its distortion, by its number in the capture's order."""
+    """The camera of a frame of the first state, without its distortion, by its number in the capture's order.
+
+    Where there is distortion, it sees a little less than the image shows, as `undistorted_camera` has it.
+    """
     frames = capture.states[0].frames
     if not 0 <= index < len(frames):
         raise InputError(f"{capture.path}: camera {index} does not exist; there are 0 to {len(frames) - 1}")

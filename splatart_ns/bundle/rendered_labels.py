@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +11,11 @@ import torch
 from torch import Tensor
 
 from splatart_ns.bundle.bundle import Bundle
+from splatart_ns.bundle.frame_camera import pinhole_pixels
 from splatart_ns.bundle.posing import moved_splat, normalized, observed_motions, part_features
 from splatart_ns.bundle.vantage import in_canonical_world
-from splatart_ns.capture.capture import UNLABELLED, Camera, Capture, Frame, Normalization
-from splatart_ns.capture.images import read_image, read_sized, undistorted_points, write_png
+from splatart_ns.capture.capture import UNLABELLED, Capture, Frame, Normalization
+from splatart_ns.capture.images import read_image, read_sized, write_png
 from splatart_ns.capture.mask_export import mask_path, write_mask_classes
 from splatart_ns.errors import InputError
 from splatart_ns.files import new_folder, replacing
@@ -85,7 +85,8 @@ def _part_shares(splat: Splat, features: Tensor, frame: Frame, normalization: No
     """How much of each pixel of a frame, as the camera took it, is background and each part: [H, W, 1 + P]."""
     camera = frame.camera
     T = torch.from_numpy(normalization.camera_to_normal(frame.T_world_camera)).to(splat.means)
-    column, row, wide = _pinhole_pixels(camera)
+    pixels, wide = pinhole_pixels(camera)
+    column, row = torch.from_numpy(np.floor(pixels).astype(np.int64)).unbind(-1)
     rendering = render(
         splat,
         viewmat_from_opengl(T[None, :3]),
@@ -98,22 +99,6 @@ def _part_shares(splat: Splat, features: Tensor, frame: Frame, normalization: No
     )
     shares = torch.cat([1 - rendering.accumulation[0], rendering.features[0]], dim=-1).cpu()
     return shares[row, column]
-
-
-def _pinhole_pixels(camera: Camera) -> tuple[Tensor, Tensor, Camera]:
-    """For every pixel of a camera, the column and row [H, W] of its ray in an image without distortion that holds all
-    of them, and the camera of that image."""
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    points = undistorted_points(np.stack([u, v], axis=-1).reshape(-1, 2), camera)
-    pixels = points * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    # Rays far beyond the image, which only a bad distortion gives, are clamped to its surroundings.
-    size = np.array([camera.width, camera.height])
-    pixels = pixels.clip(-size, 2 * size - 1e-6)
-    left, top = (math.floor(x) for x in pixels.min(axis=0))
-    right, bottom = (math.floor(x) + 1 for x in pixels.max(axis=0))
-    wide = Camera(camera.fx, camera.fy, camera.cx - left, camera.cy - top, right - left, bottom - top)
-    at = np.floor(pixels - [left, top]).astype(np.int64).reshape(camera.height, camera.width, 2)
-    return torch.from_numpy(at[..., 0]), torch.from_numpy(at[..., 1]), wide
 
 
 def _write_overlay(path: Path, frame: Frame, labels: np.ndarray, colours: np.ndarray) -> None:

@@ -19,8 +19,9 @@ class Fit:
     capture: Annotated[Path, tyro.conf.Positional]
     """Folder of the capture."""
     output_dir: Path
-    """Folder of the bundle; created, or continued when it holds a fit of this capture. One of another capture or with
-    other settings is replaced; when a stage runs again, the bundle, its metrics.json and its exports go first."""
+    """Folder of the bundle; created, or continued when it holds a fit of this capture. One with other settings, or of
+    other images in its place, is replaced; when a stage runs again, the bundle, its metrics.json and its exports go
+    first. A fit of another capture stays."""
     quality: Quality = "standard"
     """draft is fast, high is slow."""
     root: str | None = None

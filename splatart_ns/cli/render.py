@@ -16,7 +16,8 @@ from splatart_ns.cli.common import CONSOLE, choose_rasterizer
 from splatart_ns.errors import InputError
 
 if TYPE_CHECKING:  # it brings torch
-    from splatart_ns.bundle import ArticulatedSplat
+    from splatart_ns.bundle import ArticulatedSplat, Bundle
+    from splatart_ns.capture.capture import Frame
 
 
 @dataclass
@@ -58,9 +59,11 @@ class Render:
     elevation: float = 25.0
     """Degrees of the camera above the xy plane."""
     data: Path | None = None
-    """Folder of the capture, to look through one of its cameras instead."""
-    camera: int = 0
-    """Number of that camera in state 0."""
+    """Folder of the capture, to look through one of its cameras instead: at its image's size and distortion."""
+    camera: str = "0"
+    """Number of that camera in its state, or its image's name."""
+    state: str | None = None
+    """Name of the state whose camera it is, the first by default; the object stays as --set has it."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Colour behind the object, 0 to 1."""
     rasterizer: Rasterizer = "auto"
@@ -104,7 +107,7 @@ class Render:
             (self.dataset is not None, "--dataset chooses what it shows;", (*shown, "fps")),
             (self.dataset is None, "--dataset is not given; give it, or", ("states", "views", "seed")),
             (self.data is not None, "--data has cameras of its own;", ("resolution", "azimuth", "elevation")),
-            (self.data is None, "--data is not given; give it, or", ("camera",)),
+            (self.data is None, "--data is not given; give it, or", ("camera", "state")),
             (not self.sweep, "--sweep is not given; give it, or", ("frames",)),
             (not film, f"--output {self.output} is no .gif or .mp4; give one, or", ("fps",)),
         )
@@ -127,7 +130,7 @@ class Render:
     def _write_frames(self, splat: ArticulatedSplat) -> None:
         from splatart_ns.bundle import animation, configurations
         from splatart_ns.bundle import camera as cameras
-        from splatart_ns.capture.formats import load_capture
+        from splatart_ns.bundle.frame_camera import FrameView
 
         bundle, base = splat.bundle, {}
         if self.configuration is not None:
@@ -143,12 +146,29 @@ class Render:
             path = [base | q for q in rows]
         else:
             path = configurations.sweep(bundle, base, self.frames) if self.sweep else [base]
+        seen = None
         if self.data is not None:
-            view = cameras.capture_camera(load_capture(self.data), self.camera)
+            seen = FrameView(self._frame(bundle))
+            view = seen.camera
         else:
             degrees = self.azimuth
             azimuth = cameras.front_azimuth(bundle) if degrees is None else math.radians(degrees)
             sphere, elevation = cameras.bounding_sphere(bundle, path), math.radians(self.elevation)
             view = cameras.orbit_camera(*sphere, azimuth, elevation, self.resolution, self.resolution)
         images = animation.render_frames(splat, path, view, self.channel, self.background)
+        if seen is not None:
+            images = map(seen.as_taken, images)
         print(f"{animation.write_frames(images, self.output, self.fps)} frames: {self.output}")
+
+    def _frame(self, bundle: Bundle) -> Frame:
+        """Whose camera is looked through, in the bundle's world."""
+        from splatart_ns.bundle.frame_camera import find_frame
+        from splatart_ns.bundle.vantage import in_canonical_world
+        from splatart_ns.capture.formats import load_capture
+
+        capture = load_capture(self.data)
+        if self.state is not None:  # the first one's world is the bundle's
+            if len(capture.states) != len(bundle.states):
+                raise InputError(f"{self.data}: has other states than the bundle; give the capture it was fitted to.")
+            capture = in_canonical_world(capture, bundle)
+        return find_frame(capture, self.camera, self.state)

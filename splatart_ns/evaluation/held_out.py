@@ -39,8 +39,8 @@ def held_out_scores(
     Returns:
         `values` of the joints (radians, lengths); `converged`; the mean `residual` of the moving parts at those values,
         and `fitted_residual`, theirs in the views of the states that the model was fitted to: a joint that is wrong
-        makes the first much the larger; `residuals` by part; `psnr` and `part_iou` as in `images`; `unseen` parts.
-        Nulls where no view has labels.
+        makes the first much the larger; `residuals` by part; `psnr`, its `silhouette` and `part_iou` as in `images`;
+        `unseen` parts. Nulls where no view has labels.
     """
     views = _held_out_views(capture, state)
     found = fit_configuration(bundle, views, capture.normalization)
@@ -53,6 +53,7 @@ def held_out_scores(
         "fitted_residual": _mean([fitted[name] for name in both]),
         "residuals": found.residual,
         "psnr": scores["psnr"],
+        "silhouette": scores["silhouette"],
         "part_iou": scores["part_iou"],
         "unseen": found.unseen,
     }

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,8 +19,9 @@ from splatart_ns.evaluation.ground_truth import GroundTruth, NovelState, TrueJoi
 from splatart_ns.evaluation.joints import find_joint
 from splatart_ns.rasterize.render import render
 from splatart_ns.rasterize.ssim import ssim
+from splatart_ns.stages.silhouette import with_silhouette
 
-KEYS = ("psnr", "ssim", "lpips", "accumulation_l1", "part_iou")
+KEYS = ("psnr", "ssim", "lpips", "accumulation_l1", "part_iou", "silhouette")
 
 
 def psnr(a: Tensor, b: Tensor) -> float:
@@ -40,33 +43,45 @@ def image_scores(
     views: Sequence[View],
     capture: Capture,
     device: torch.device | str = "cpu",
-) -> tuple[dict[str, float | None], list[str]]:
+) -> tuple[dict[str, Any], list[str]]:
     """The scores of the object, its parts moved by `motions`, over views of a capture; and notes on nulls.
 
-    Image scores are means over the views, on white. A part's IoU counts the pixels of all labelled views together,
-    and `part_iou` is the mean over the parts, of the capture or the bundle, that any of them shows or predicts.
+    Image scores are means over the views, on white: over those that say where the object ends, by alpha or labels;
+    where none does, colours are compared within the silhouette that is rendered. `silhouette`: "given" or "rendered".
+    A part's IoU counts the pixels of all labelled views together, and `part_iou` is the mean over the parts, of the
+    capture or the bundle, that any of them shows or predicts.
     """
-    scores: dict[str, float | None] = dict.fromkeys(KEYS)
+    scores: dict[str, Any] = dict.fromkeys(KEYS)
     notes = []
+    known = [with_silhouette(view) for view in views]
+    own = any(view is not None for view in known)
     splat = normalized(moved_splat(bundle, motions), capture.normalization).to(device)
     features, ids = part_features(bundle).to(device), torch.tensor([part.id for part in bundle.parts])
     white = torch.ones(3)
     per_view: dict[str, list[float]] = {"psnr": [], "ssim": [], "accumulation_l1": []}
     parts = sorted({*ids.tolist(), *capture.parts})
     overlap = torch.zeros(len(parts), 2, dtype=torch.long)
-    for view in views:
+    for view, given in zip(views, known, strict=True):
         viewmat, K = view.viewmat[None].to(device), view.K[None].to(device)
         rendering = render(splat, viewmat, K, view.width, view.height, features=features, with_depth=False)
         accumulation = rendering.accumulation[0].cpu()
         if view.labels is not None:
             shown = predicted_parts(accumulation, rendering.features[0].cpu(), ids)
             overlap += part_overlap(shown, view.labels.long(), parts)
-        if view.alpha is not None:
-            image = (rendering.rgb[0].cpu() + (1 - accumulation) * white).clamp(0, 1)
-            truth = view.rgb_on(white)
-            per_view["psnr"].append(psnr(image, truth))
-            per_view["ssim"].append(float(ssim(image, truth)))
-            per_view["accumulation_l1"].append(float((accumulation[..., 0] - view.alpha.float() / 255).abs().mean()))
+        shown = (255 * accumulation[..., 0]).round().to(torch.uint8)
+        if given is None and (own or not shown.any()):
+            continue
+        image = (rendering.rgb[0].cpu() + (1 - accumulation) * white).clamp(0, 1)
+        truth = (given or replace(view, alpha=shown)).rgb_on(white)
+        counts = torch.ones_like(shown, dtype=torch.bool)
+        if given is not None and view.alpha is None:  # labels may leave open whose a pixel is
+            counts = view.labels != UNLABELLED
+            truth = torch.where(counts[..., None], truth, image)
+        per_view["psnr"].append(psnr(image[counts], truth[counts]))
+        per_view["ssim"].append(float(ssim(image, truth)))
+        if given is not None:
+            wrong = (accumulation[..., 0] - given.alpha.float() / 255).abs()
+            per_view["accumulation_l1"].append(float(wrong[counts].mean()))
     for key, values in per_view.items():
         scores[key] = sum(values) / len(values) if values else None
     seen = overlap[:, 1] > 0
@@ -74,8 +89,15 @@ def image_scores(
         scores["part_iou"] = float((overlap[seen, 0] / overlap[seen, 1]).mean())
     else:
         notes.append("part_iou: no test view is labelled")
-    if not per_view["psnr"]:
-        notes.append("psnr, ssim, accumulation_l1: no test view has a silhouette (alpha or object mask)")
+    if per_view["psnr"]:
+        scores["silhouette"] = "given" if own else "rendered"
+    if not own:
+        notes.append(
+            "psnr, ssim: no test view has a silhouette (alpha, object mask or labels); colours are compared within the "
+            "rendered one, so that what is missing of the object, or too much, does not count"
+            if per_view["psnr"]
+            else "psnr, ssim: no test view shows the object"
+        )
     return scores, notes
 
 

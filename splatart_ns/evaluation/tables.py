@@ -59,14 +59,22 @@ def format_tables(metrics: dict[str, Any]) -> list[Table | Text]:
             if values is not None
             for row in [(name, "state 0", values), (name, "last state", values["last"])]
         ]),
-        _table("Images, test views", ["configuration"], _IMAGE_COLUMNS, list(metrics["images"].items())),
-        _table("Held-out configurations, values found in images", ["configuration"], _HELD_OUT_COLUMNS, list(
-            metrics["held_out"].items()
+        _table("Images, test views", ["configuration"], _IMAGE_COLUMNS, _views(metrics["images"])),
+        _table("Held-out configurations, values found in images", ["configuration"], _HELD_OUT_COLUMNS, _views(
+            metrics["held_out"]
         )),
     ]  # fmt: skip
     lines = [f"{key}: {_shown(value)}" for key, value in metrics["structure"].items()]
     lines += [f"note: {note}" for note in metrics["notes"]]
     return [*(table for table in tables if table.row_count > 0), *(Text(line) for line in lines)]
+
+
+def _views(scores: dict[str, dict[str, Any]]) -> list[tuple[str, dict[str, Any]]]:
+    """Rows, which say where figures mean something else: colours within the rendered silhouette."""
+    return [
+        (f"{name} (rendered silhouette)" if values.get("silhouette") == "rendered" else name, values)
+        for name, values in scores.items()
+    ]
 
 
 def _known(values: dict[str, Any]) -> list[bool]:

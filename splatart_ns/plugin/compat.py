@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import random
 import sys
-from collections.abc import Mapping, Sequence
+import tempfile
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -14,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerControl
@@ -134,12 +138,30 @@ def _has_sizes(tensor: torch.Tensor, shape: Sequence[int | str], sizes: dict[str
     return all(size == (sizes.setdefault(s, size) if isinstance(s, str) else s) for s, size in pairs)
 
 
-def finished_runs(capture: Path, method: str) -> list[Path]:
-    """The config.yml of every run of a method on a capture under outputs/ that took all its steps, oldest first.
+@contextmanager
+def saved_aside(trainer: Trainer) -> Iterator[None]:
+    """A block in which a trainer saves a checkpoint: it gets its name, and older ones go, when all of it is written."""
+    folder = trainer.checkpoint_dir
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".saving-") as aside:
+        trainer.checkpoint_dir = Path(aside)  # where `save_checkpoint` writes
+        try:
+            yield
+        finally:
+            trainer.checkpoint_dir = folder
+        older = list(folder.glob("*.ckpt")) if trainer.config.save_only_latest_checkpoint else []
+        new = [file.replace(folder / file.name) for file in Path(aside).glob("*.ckpt")]
+        for file in older:
+            if file not in new:
+                file.unlink()
+
+
+def finished_runs(runs_dir: Path, capture: Path, method: str) -> list[Path]:
+    """The config.yml of every run of a method on a capture, below `runs_dir`, that took all its steps; oldest first.
 
     One that cannot be read may be of another capture, and does not count.
     """
-    configs = Path("outputs").glob(f"*/{method}/*/config.yml")
+    configs = runs_dir.glob(f"*/{method}/*/config.yml")
     saved = [c for c in configs if _saved_steps(c) > 0]
     on_capture = [c for c in saved if _is_of(c, os.path.realpath(capture))]
     finished = [c for c in on_capture if _saved_steps(c) >= _steps_of(c)]
@@ -147,9 +169,12 @@ def finished_runs(capture: Path, method: str) -> list[Path]:
 
 
 def _saved_steps(config: Path) -> int:
-    """How many steps a run had taken at its newest checkpoint; 0 if it has left none."""
-    numbers = (file.stem.removeprefix("step-") for file in config.parent.glob("nerfstudio_models/step-*.ckpt"))
-    return max((int(number) + 1 for number in numbers if number.isdecimal()), default=0)
+    """How many steps a run had taken at its newest checkpoint; 0 if it has left none, or one that was cut off."""
+    newest = max(config.parent.glob("nerfstudio_models/step-*.ckpt"), default=None)
+    number = "" if newest is None else newest.stem.removeprefix("step-")
+    if not number.isdecimal() or not zipfile.is_zipfile(newest):  # torch's files end with their list of contents
+        return 0
+    return int(number) + 1
 
 
 def _steps_of(config: Path) -> int:

@@ -19,6 +19,7 @@ from splatart_ns.choices import Quality, Rasterizer, RefineCameras, Worlds
 from splatart_ns.errors import InputError
 from splatart_ns.machine import num_cores
 from splatart_ns.plugin.companion import Companions
+from splatart_ns.plugin.fit_lock import alone_in
 from splatart_ns.plugin.report import Report
 from splatart_ns.plugin.settings import Settings, require_fittable
 from splatart_ns.plugin.stage_configs import stage_configs
@@ -58,25 +59,19 @@ def fit(
     if is_inside(output_dir, capture_path) or any(is_inside(folder, output_dir) for folder in folders):
         raise InputError(f"{output_dir} holds the capture's files; choose another --output-dir, beside it.")
     output_dir = output_dir.absolute()
-    report = Report(output_dir / "report.json", capture, settings)
-    try:
-        (output_dir / "runs").mkdir(parents=True, exist_ok=True)
-        probe = output_dir / ".writable"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(f"{output_dir} cannot be written ({error.strerror}); choose another --output-dir.") from None
-
-    for warning in warnings[:MOST_WARNINGS]:
-        CONSOLE.log(f"Warning: {warning}.", markup=False)
-    if more := len(warnings[MOST_WARNINGS:]):
-        CONSOLE.log(f"And {more} more warnings, see `splatart check {capture_path}`.", markup=False)
-    configs = stage_configs(capture, output_dir, settings)
-    pose, joint = (configs.pop(name) for name in ("pose", "joint"))
-    with kernel_threads(num_cores()), _progress() as progress:
-        _train(configs, rasterizer, report, progress, companions)
-        _train({"pose": pose}, rasterizer, report, progress)
-        _train({"joint": joint}, rasterizer, report, progress, whole=_is_whole(output_dir))
+    with alone_in(output_dir):
+        report = Report(output_dir / "report.json", capture, settings)
+        (output_dir / "runs").mkdir(exist_ok=True)
+        for warning in warnings[:MOST_WARNINGS]:
+            CONSOLE.log(f"Warning: {warning}.", markup=False)
+        if more := len(warnings[MOST_WARNINGS:]):
+            CONSOLE.log(f"And {more} more warnings, see `splatart check {capture_path}`.", markup=False)
+        configs = stage_configs(capture, output_dir, settings)
+        pose, joint = (configs.pop(name) for name in ("pose", "joint"))
+        with kernel_threads(num_cores()), _progress() as progress:
+            _train(configs, rasterizer, report, progress, companions)
+            _train({"pose": pose}, rasterizer, report, progress)
+            _train({"joint": joint}, rasterizer, report, progress, whole=_is_whole(output_dir))
     return output_dir
 
 

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerSlider
 from torch import Tensor, nn
@@ -29,7 +28,7 @@ from splatart_ns.geometry.se3 import se3_exp, se3_log
 from splatart_ns.plugin.compat import finished_runs, read_checkpoint
 from splatart_ns.plugin.gaussians import SPLAT_SHAPES, gauss_params_from_splat, splat_from_state
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig, refuse_unread
-from splatart_ns.plugin.pipeline import StagePipeline
+from splatart_ns.plugin.trainer import LaterPipelineConfig, StageTrainer, StageTrainerConfig, errors_of_saving
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics, shifted
 from splatart_ns.stages.joint_constraint import parse_constraints
@@ -182,12 +181,12 @@ def normal_values(fit: JointFit, normalization: Normalization) -> Tensor:
 
 
 @dataclass
-class JointPipelineConfig(VanillaPipelineConfig):
+class JointPipelineConfig(LaterPipelineConfig):
     """Stages 3 and 4."""
 
     _target: type = field(default_factory=lambda: JointPipeline)
     pose_run: Path | None = None
-    """The config.yml of the splatart-pose run; the latest one on this capture under outputs/ when not given."""
+    """The config.yml of the splatart-pose run; the latest one on this capture below `runs_dir` when not given."""
     root: str | None = None
     """Name of the part that the others hang on; chosen when not given."""
     joints: tuple[str, ...] = ()
@@ -202,7 +201,7 @@ class JointPipelineConfig(VanillaPipelineConfig):
     """Noted in the bundle."""
 
 
-class JointPipeline(StagePipeline):
+class JointPipeline(VanillaPipeline):
     """Fits joints and tree to the poses of a splatart-pose run."""
 
     config: JointPipelineConfig
@@ -214,7 +213,7 @@ class JointPipeline(StagePipeline):
         refuse_unread(self.model.config, "splatart-joint")
         capture = self.datamanager.capture
         normalization = capture.normalization
-        state = _read_pose_run(config.pose_run or find_pose_run(capture.path), capture)
+        state = _read_pose_run(config.pose_run or find_pose_run(config.runs_dir, capture.path), capture)
         splat = splat_from_state(state)
         motions = torch.from_numpy(normalization.motion_to_world(state["_model.poses.base"].numpy()))
         covariances = covariances_to_world(state["_model.covariance"], normalization)
@@ -340,18 +339,20 @@ def covariances_to_world(covariance: Tensor, normalization: Normalization) -> Te
     return A @ covariance.double() @ A.T
 
 
-def find_pose_run(capture: Path) -> Path:
-    """The latest finished splatart-pose run on the capture under outputs/.
+def find_pose_run(runs_dir: Path, capture: Path) -> Path:
+    """The latest finished splatart-pose run on the capture below a folder of runs.
 
     Raises:
         InputError: when there is none.
     """
-    runs = finished_runs(capture, "splatart-pose")
+    runs = finished_runs(runs_dir, capture, "splatart-pose")
     if not runs:
         raise InputError(
-            f"outputs/ holds no finished splatart-pose run on {capture}; run `ns-train splatart-pose --data {capture}` "
-            f"first, or name its config.yml by --pipeline.pose-run."
+            f"{runs_dir} holds no finished splatart-pose run on {capture}; run "
+            f"`ns-train splatart-pose --data {capture}` first, or name its --output-dir by --pipeline.runs-dir or its "
+            "config.yml by --pipeline.pose-run."
         )
+    CONSOLE.print(f"Poses: {runs[-1]}", markup=False, soft_wrap=True)
     return runs[-1]
 
 
@@ -364,7 +365,7 @@ def _pose_shapes(S: int, P: int) -> dict[str, tuple[int, ...]]:
 
 
 @dataclass
-class JointTrainerConfig(TrainerConfig):
+class JointTrainerConfig(StageTrainerConfig):
     """A run without training steps: joints are fitted, the checkpoint and the bundle are written."""
 
     _target: type = field(default_factory=lambda: JointTrainer)
@@ -372,7 +373,7 @@ class JointTrainerConfig(TrainerConfig):
     """Where the bundle goes; the run's folder `bundle` when not given."""
 
 
-class JointTrainer(Trainer):
+class JointTrainer(StageTrainer):
     """Writes what the pipeline found and, with the viewer on, shows it."""
 
     config: JointTrainerConfig
@@ -382,8 +383,9 @@ class JointTrainer(Trainer):
             self.base_dir / "dataparser_transforms.json"
         )
         folder = self.config.bundle_dir or self.base_dir / "bundle"
-        save_bundle(self.pipeline.bundle, folder)
-        self.save_checkpoint(self.step)
+        with errors_of_saving(self.checkpoint_dir):
+            save_bundle(self.pipeline.bundle, folder)
+            self.save_checkpoint(self.step)
         print(f"Bundle: {folder}\nConfig: {self.base_dir / 'config.yml'}")  # CONSOLE breaks lines
         self._init_viewer_state()
         self.pipeline.eval()

@@ -9,6 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.models.base_model import Model
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from splatart_ns.choices import Rasterizer
@@ -62,6 +63,8 @@ class SplatartModel(SplatfactoModel):
     """Splatfacto with part logits; everything it renders comes out of one rasterization."""
 
     config: SplatartModelConfig
+    shows_surroundings = False
+    """Whether also what lies around the object is modelled, where images do not tell where it ends."""
 
     def populate_modules(self) -> None:
         """Gaussians from seed points or at random, strategy and metrics; nothing is downloaded."""
@@ -80,6 +83,8 @@ class SplatartModel(SplatfactoModel):
                 "--pipeline.model.color-corrected-metrics is True, but SPLATART's models measure images as they are; "
                 "leave it out: splatart-semantic brings frames to one exposure."
             )
+        if not 0 <= (degree := self.config.sh_degree) <= 3:
+            raise InputError(f"--pipeline.model.sh-degree is {degree}; give 0 to 3.")
         if self.config.rasterizer != "auto":
             set_backend(self.config.rasterizer)
             if self.config.rasterizer == "numba" and torch.device(self.kwargs.get("device", "cpu")).type != "cpu":
@@ -101,6 +106,7 @@ class SplatartModel(SplatfactoModel):
         self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.register_buffer("palette", part_colours(self.num_parts), persistent=False)
         self.step = 0
+        self._told_within_rendered = False
         self.crop_box = None
         self.background_color = {"black": torch.zeros(3)}.get(self.config.background_color, torch.ones(3))
 
@@ -182,19 +188,39 @@ class SplatartModel(SplatfactoModel):
         return {"psnr": -10 * mse.clamp_min(1e-10).log10(), "gaussian_count": self.num_points}
 
     def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR, SSIM, LPIPS (when asked for) and part IoU of one evaluation image, and pictures to look at."""
-        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        """PSNR, SSIM, LPIPS (when asked for) and part IoU of one evaluation image, and pictures to look at.
+
+        The object alone is compared with opaque images within its rendered silhouette, and `rendered_silhouette` is 1.
+        """
+        image = self.get_gt_img(batch["image"])
+        within_rendered = image.shape[-1] == 3 and not self.shows_surroundings
+        if within_rendered:
+            image = torch.cat([image, outputs["accumulation"]], dim=-1)
+            self._tell_within_rendered()
+        target = self.composite_with_background(image, outputs["background"])
         rgb = outputs["rgb"]
         metrics = {
             "psnr": float(-10 * (rgb - target).square().mean().clamp_min(1e-10).log10()),
             "ssim": float(ssim(rgb, target)),
         }
+        if not self.shows_surroundings:
+            metrics["rendered_silhouette"] = float(within_rendered)
         if self.config.lpips:
             metrics["lpips"] = float(self._lpips()(target.movedim(-1, 0)[None], rgb.movedim(-1, 0)[None]))
         images = {"img": torch.cat([target, rgb], dim=1), "accumulation": outputs["accumulation"]}
         if "parts" in outputs:
             images["parts"] = outputs["parts"]
         return metrics, images
+
+    def _tell_within_rendered(self) -> None:
+        """Say so once."""
+        if not self._told_within_rendered:
+            self._told_within_rendered = True
+            CONSOLE.print(
+                "Images do not tell where the object ends: figures are measured within its rendered silhouette, and "
+                "do not compare with those of other captures.",
+                **{"markup": False, "soft_wrap": True},
+            )
 
     def _lpips(self) -> nn.Module:
         """Built on first use: its constructor downloads weights."""

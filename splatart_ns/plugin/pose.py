@@ -16,7 +16,7 @@ import torch
 from gsplat.strategy.ops import remove
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
-from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
@@ -27,8 +27,8 @@ from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import inverse, so3_log
 from splatart_ns.plugin.gaussians import gauss_params_from_splat
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig, refuse_unread
-from splatart_ns.plugin.pipeline import StagePipeline
 from splatart_ns.plugin.semantic_run import find_semantic_runs, read_state
+from splatart_ns.plugin.trainer import LaterPipelineConfig
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.flush import border_against_others
@@ -133,13 +133,13 @@ class PoseModel(SplatartModel):
 
 
 @dataclass
-class PosePipelineConfig(VanillaPipelineConfig):
+class PosePipelineConfig(LaterPipelineConfig):
     """Stage 2."""
 
     _target: type = field(default_factory=lambda: PosePipeline)
     semantic_runs: tuple[Path, ...] = ()
-    """The config.yml of each state's splatart-semantic run, in the order of the states; found under
-    outputs/<capture>/splatart-semantic when not given."""
+    """The config.yml of each state's splatart-semantic run, in the order of the states; the latest ones on
+    this capture below `runs_dir` when not given."""
     init: Literal["registration", "centroids", "file"] = "registration"
     """How poses start: many-start ICP chosen by rendering, parts' centroids, or `init_file`."""
     init_file: Path | None = None
@@ -152,7 +152,7 @@ class PosePipelineConfig(VanillaPipelineConfig):
     """Seed of the registration and of the order of views."""
 
 
-class PosePipeline(StagePipeline):
+class PosePipeline(VanillaPipeline):
     """Estimates T[state][part] over all states of a capture, then merges and polishes the parts' Gaussians."""
 
     config: PosePipelineConfig
@@ -170,7 +170,7 @@ class PosePipeline(StagePipeline):
                 f"{', '.join(capture.parts.values())}, or leave it out."
             )
         refuse_unread(self.model.config, "splatart-pose")
-        runs = config.semantic_runs or find_semantic_runs(capture.path, len(capture.states))
+        runs = config.semantic_runs or find_semantic_runs(config.runs_dir, capture.path, len(capture.states))
         if len(runs) != len(capture.states):
             raise InputError(
                 f"--pipeline.semantic-runs names {len(runs)} of the runs of {capture.path}, which has "

@@ -24,6 +24,8 @@ from splatart_ns.rasterize.rasterization import default_backend, default_device
 from splatart_ns.shape import NUMBER, has_shape, parse
 
 _REPORT = {"stages": [{"name": str, "seconds": NUMBER}], "settings": dict, "versions": dict}
+_CAPTURE = ("capture", "capture_sha256")
+"""Where it lies, and what it holds: it may be moved, or changed, and is another one if both differ."""
 TRAINED_ON = ("device", "rasterizer")
 """What the report says of the machine that trained; the one that finds the joints may be another, without a GPU."""
 
@@ -65,8 +67,12 @@ class Report:
             raise InputError(
                 f"{self.path} is not a report of `splatart fit`; remove it or choose another --output-dir."
             )
+        if all(isinstance(had := earlier.get(key), str) and had != self.data[key] for key in _CAPTURE):
+            raise InputError(
+                f"{self.path.parent} holds a fit of {earlier['capture']}; choose another --output-dir, or remove it."
+            )
         had, wanted = earlier["settings"], self.data["settings"]
-        same = all(earlier.get(key) == self.data[key] for key in ("capture", "capture_sha256"))
+        same = all(earlier.get(key) == self.data[key] for key in _CAPTURE)
         last = ("root", "joints") if wanted["worlds"] == "shared" else ("joints",)  # the last stage alone asks
         same = same and {k: v for k, v in had.items() if k not in last} == {
             k: v for k, v in wanted.items() if k not in last
@@ -77,7 +83,7 @@ class Report:
         if same and version_had == version_here:
             self.data |= {key: earlier[key] for key in TRAINED_ON if key in earlier}
             return stages
-        other = f"by splatart-ns {version_had}" if same else "of another capture or with other settings"
+        other = f"by splatart-ns {version_had}" if same else "of other images or with other settings"
         CONSOLE.print(f"{self.path.parent} holds a fit {other}; starting over.", markup=False)
         return []
 

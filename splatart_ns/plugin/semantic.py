@@ -9,7 +9,7 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
@@ -22,7 +22,6 @@ from splatart_ns.choices import RefineCameras
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig
-from splatart_ns.plugin.pipeline import StagePipeline
 from splatart_ns.rasterize.ssim import l1_ssim_loss
 from splatart_ns.stages.camera_refinement import (
     EXACT_PIXELS,
@@ -87,6 +86,7 @@ class SemanticModel(SplatartModel):
     """Two phases in one run: all but the logits, then the logits alone."""
 
     config: SemanticModelConfig
+    shows_surroundings = True
 
     def populate_modules(self) -> None:
         super().populate_modules()
@@ -225,7 +225,7 @@ class SemanticPipelineConfig(VanillaPipelineConfig):
     _target: type = field(default_factory=lambda: SemanticPipeline)
 
 
-class SemanticPipeline(StagePipeline):
+class SemanticPipeline(VanillaPipeline):
     """Lets the second phase see labelled frames only, and starts it from votes."""
 
     def __init__(self, *args, **kwargs):

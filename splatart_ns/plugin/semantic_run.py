@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from splatart_ns.capture.capture import Capture
@@ -12,7 +15,7 @@ from splatart_ns.capture.digest import training_digest
 from splatart_ns.capture.seen_surface import measured_surface
 from splatart_ns.capture.view import View, load_views
 from splatart_ns.errors import InputError
-from splatart_ns.plugin.compat import finished_runs, read_checkpoint, run_setting
+from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_config, run_setting
 from splatart_ns.plugin.gaussians import SPLAT_SHAPES, splat_from_state
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.exposure import at_gain
@@ -82,25 +85,47 @@ def _require_trained_on(capture: Capture, state: int, run: Path, digest: list[in
     )
 
 
-def find_semantic_runs(capture: Path, num_states: int) -> tuple[Path, ...]:
-    """The config.yml of the latest finished splatart-semantic run of each state under outputs/.
+def find_semantic_runs(runs_dir: Path, capture: Path, num_states: int) -> tuple[Path, ...]:
+    """The config.yml of the latest finished splatart-semantic run of each state below a folder of runs.
 
     Raises:
         InputError: naming a state that has none.
     """
     found: dict[int, Path] = {}
-    for config in finished_runs(capture, "splatart-semantic"):
+    for config in finished_runs(runs_dir, capture, "splatart-semantic"):
         state = run_setting(config, "pipeline", "datamanager", "dataparser", "state")
         if isinstance(state, int):
             found[state] = config
     for state in range(num_states):
         if state not in found:
             raise InputError(
-                f"outputs/ holds no finished splatart-semantic run of state {state} of {capture}; run "
-                f"`ns-train splatart-semantic --data {capture} splatart-capture --state {state}` first, or name the "
-                "config.yml of every state's run by --pipeline.semantic-runs."
+                f"{runs_dir} holds no finished splatart-semantic run of state {state} of {capture}; run "
+                f"`ns-train splatart-semantic --data {capture} splatart-capture --state {state}` first, or name its "
+                "--output-dir by --pipeline.runs-dir or every state's config.yml by --pipeline.semantic-runs."
             )
-    return tuple(found[s] for s in range(num_states))
+        CONSOLE.print(f"State {state}: {found[state]}", markup=False, soft_wrap=True)
+    runs = tuple(found[s] for s in range(num_states))
+    if names := _differing_settings(runs):
+        CONSOLE.print(
+            f"Warning: these runs had different settings ({', '.join(names)}), so that one state is worse known than "
+            "another; train them alike, or name others by --pipeline.semantic-runs.",
+            **{"markup": False, "soft_wrap": True},
+        )
+    return runs
+
+
+def _differing_settings(runs: Sequence[Path]) -> list[str]:
+    """Names of the settings of a splat's training that are not the same in all runs."""
+    settings = [_settings(run) for run in runs]
+    names = {name: None for each in settings for name in each}  # in their order
+    return [name for name in names if any(each.get(name) != settings[0].get(name) for each in settings)]
+
+
+def _settings(run: Path) -> dict[str, Any]:
+    fields = read_run_config(run)
+    manager, model = (fields["pipeline"].get(name) for name in ("datamanager", "model"))
+    own = {name: value for name, value in manager.items() if name not in ("data", "dataparser")}
+    return {"max_num_iterations": fields["max_num_iterations"], **own, **(model if isinstance(model, dict) else {})}
 
 
 def learned_views(capture: Capture, state: int, checkpoint: dict[str, Tensor], downscale: int = 1) -> list[View]:

@@ -8,9 +8,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
-from pathlib import Path
 from queue import SimpleQueue
 
 import torch
@@ -18,7 +17,6 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
 from splatart_ns.choices import Rasterizer
-from splatart_ns.errors import DISK_ERRORS, InputError
 from splatart_ns.machine import num_cores
 from splatart_ns.plugin.companion import Companion, Companions, Outcome
 from splatart_ns.plugin.compat import seed_everything, stop_event_writers
@@ -38,8 +36,7 @@ def run_stage(config: TrainerConfig, on_step: Callable[[int], None]) -> Outcome:
     stop_event_writers()
     after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
     trainer.callbacks.append(TrainingCallback(after, lambda step: on_step(step + 1)))
-    with _saving(trainer.checkpoint_dir):
-        trainer.train()
+    trainer.train()
     on_step(config.max_num_iterations)
     return {
         "seconds": round(time.perf_counter() - start, 2),
@@ -49,20 +46,6 @@ def run_stage(config: TrainerConfig, on_step: Callable[[int], None]) -> Outcome:
         "notes": getattr(trainer.pipeline, "notes", []),
         **getattr(trainer.pipeline, "findings", {}),
     }
-
-
-@contextmanager
-def _saving(folder: Path) -> Iterator[None]:
-    """Turn what a full disk raises into an `InputError`; torch does not say why a checkpoint cannot be written."""
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
-        why = error.strerror if isinstance(error, OSError) and error.errno in DISK_ERRORS else None
-        if "inline_container.cc" in str(error):
-            why = "torch could not save a checkpoint"
-        if why is None:
-            raise
-        raise InputError(f"{folder}: cannot be written ({why}); check the space on the disk.") from error
 
 
 ON_ONE_GPU = 2

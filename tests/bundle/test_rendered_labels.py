@@ -4,13 +4,11 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from splatart_ns.bundle import load_bundle
-from splatart_ns.bundle.rendered_labels import _pinhole_pixels, write_labels
-from splatart_ns.capture.capture import Camera
+from splatart_ns.bundle.rendered_labels import write_labels
 from splatart_ns.capture.formats import load_capture
-from splatart_ns.capture.images import read_labels, undistorted_points
+from splatart_ns.capture.images import read_labels
 from splatart_ns.capture.label_import import import_labels
 from splatart_ns.errors import InputError
 
@@ -75,22 +73,3 @@ def test_a_labelled_capture_and_another_capture_are_refused(hinge_fit, hinge_cap
     bundle.parts[0].name = "another"
     with pytest.raises(InputError, match="other states or parts"):
         write_labels(bundle, load_capture(sparse_capture), tmp_path / "out")
-
-
-def test_a_pixel_without_distortion_is_its_own():
-    column, row, wide = _pinhole_pixels(Camera(50.0, 40.0, 8.0, 6.5, 16, 12))
-    assert (wide.width, wide.height) == (16, 12)
-    assert torch.equal(column, torch.arange(16).expand(12, 16)) and torch.equal(
-        row, torch.arange(12)[:, None].expand(12, 16)
-    )
-
-
-@pytest.mark.parametrize("k1", [-0.3, 0.2])
-def test_the_wide_image_holds_every_pixel_s_ray(k1):
-    camera = Camera(50.0, 52.0, 30.0, 25.0, 64, 48, distortion=(k1, 0.02, 0.0, 0.0, 0.003, 0.001))
-    column, row, wide = _pinhole_pixels(camera)
-    assert 0 <= column.min() and column.max() < wide.width and 0 <= row.min() and row.max() < wide.height
-    rays = undistorted_points(np.array([[0.5, 0.5], [63.5, 47.5], [40.5, 3.5]]), camera)
-    for (u, v), ray in zip([(0, 0), (63, 47), (40, 3)], rays, strict=True):
-        at = np.array([column[v, u], row[v, u]]) + 0.5
-        assert np.abs((at - [wide.cx, wide.cy]) / [wide.fx, wide.fy] - ray).max() < 0.011

@@ -57,6 +57,13 @@ def test_a_long_name_is_broken_and_no_figure_cut_short(folder, capture):
     assert sum("0.000124" in line for line in lines) == len(metrics["joints"])
 
 
+def test_figures_within_the_rendered_silhouette_are_marked_in_their_row(folder, capture):
+    metrics = evaluate(folder, capture)
+    assert "rendered silhouette" not in printed(metrics)
+    metrics["images"]["state_01"]["silhouette"] = "rendered"
+    assert "state_01 (rendered silhouette)" in printed(metrics)
+
+
 def test_a_wrong_motion_shows_in_the_images_of_its_state(bundle, folder, capture):
     bundle.parts[2].motion[1, :3, 3] += 0.3
     save_bundle(bundle, folder)

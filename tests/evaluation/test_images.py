@@ -1,12 +1,14 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from splatart_ns.bundle import configured_motions, joint_motion, normalized, observed_motions
-from splatart_ns.capture.capture import Capture, Normalization
-from splatart_ns.capture.view import View
+from splatart_ns.capture.capture import UNLABELLED, Capture, Normalization
+from splatart_ns.capture.formats import load_capture
+from splatart_ns.capture.view import View, load_views
 from splatart_ns.evaluation.images import image_scores, is_mapped, mapped_value, novel_motions, part_overlap, psnr
 
 D = torch.float64
@@ -30,11 +32,40 @@ def test_a_splat_is_brought_to_the_normalised_world(bundle):
     torch.testing.assert_close(out.scales, 0.5 * splat.scales)
 
 
-def test_views_without_silhouettes_and_labels_score_null_and_say_so(bundle, tmp_path):
-    view = View("v", torch.eye(4), torch.eye(3), 2, 2, torch.zeros(2, 2, 3, dtype=torch.uint8))
+def test_views_without_silhouettes_and_labels_that_do_not_show_the_object_score_null_and_say_so(bundle, tmp_path):
+    away = torch.eye(4)
+    away[2, 3] = -100
+    view = View("v", away, torch.eye(3), 2, 2, torch.zeros(2, 2, 3, dtype=torch.uint8))
     scores, notes = image_scores(bundle, observed_motions(bundle, 0), [view], Capture(tmp_path, (), {}))
     assert set(scores.values()) == {None}
     assert len(notes) == 2
+
+
+@pytest.fixture
+def opaque_views(capture):
+    """The test views of state 0 in front of grey, labelled and without an alpha."""
+    views = load_views(load_capture(capture), load_capture(capture).states[0], "test")
+    return [replace(view, rgb=(255 * view.rgb_on(torch.full((3,), 0.4))).byte(), alpha=None) for view in views]
+
+
+def test_opaque_views_are_compared_within_the_rendered_silhouette_and_marked(bundle, capture, opaque_views):
+    views = [replace(view, labels=None) for view in opaque_views]
+    scores, notes = image_scores(bundle, observed_motions(bundle, 0), views, load_capture(capture))
+    assert scores["psnr"] > 35 and scores["ssim"] > 0.98
+    assert scores["silhouette"] == "rendered" and scores["accumulation_l1"] is None
+    assert any("within the rendered one" in note for note in notes)
+
+
+def test_labels_are_silhouettes_and_unlabelled_pixels_do_not_count(bundle, capture, opaque_views):
+    labels = opaque_views[0].labels
+    opaque_views[0] = replace(opaque_views[0], labels=torch.where(labels == 1, UNLABELLED, labels))
+    views = [opaque_views[0], *(replace(view, labels=None) for view in opaque_views[1:])]
+    scores, notes = image_scores(bundle, observed_motions(bundle, 0), views, load_capture(capture))
+    assert scores["silhouette"] == "given" and notes == []
+    assert scores["psnr"] > 20 and scores["accumulation_l1"] < 0.05
+    bundle.parts[1].motion[0, :3, 3] += 0.3
+    moved, _ = image_scores(bundle, observed_motions(bundle, 0), views, load_capture(capture))
+    assert moved["psnr"] < scores["psnr"] - 3 and moved["accumulation_l1"] > 2 * scores["accumulation_l1"]
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

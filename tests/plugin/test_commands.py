@@ -132,6 +132,7 @@ def watched(commands: Commands, *argv: object) -> Iterator[ViewerClient]:
 
 
 WATCHED = ("--data", "hinge", "--output-dir", "watched")
+LATER = (*WATCHED, "--pipeline.runs-dir", "outputs")
 
 
 def test_the_semantic_stage_can_be_watched(commands: Commands) -> None:
@@ -142,13 +143,13 @@ def test_the_semantic_stage_can_be_watched(commands: Commands) -> None:
 
 def test_the_pose_stage_can_be_watched(commands: Commands, semantic_run: Path) -> None:
     steps = ("--max-num-iterations", 20, "--pipeline.model.pose-steps", 10)
-    with watched(commands, "ns-train", "splatart-pose", *WATCHED, *steps) as client:
+    with watched(commands, "ns-train", "splatart-pose", *LATER, *steps) as client:
         assert client.settled_image().std() > 5
 
 
 @pytest.mark.parametrize("command", ["ns-viewer", "ns-train"])
 def test_a_slider_moves_its_part_in_the_viewer(commands: Commands, command: str, joint_run: Path) -> None:
-    what = ("--load-config", joint_run) if command == "ns-viewer" else ("splatart-joint", *WATCHED)
+    what = ("--load-config", joint_run) if command == "ns-viewer" else ("splatart-joint", *LATER)
     with watched(commands, command, *what) as client:
         slider = client.slider("base_to_lid (degree)")
         assert slider["min"] < slider["value"] < slider["max"]

@@ -74,7 +74,7 @@ def test_finished_runs_are_found_by_their_data_and_in_the_order_of_time(
     write_run(Path("outputs/door/splatart-joint/e"), Path("captures/door.v1"))
     os.utime(old, (1, 1))
     os.utime(new, (2, 2))
-    assert finished_runs(Path("captures/door.v1"), "splatart-pose") == [old, new]
+    assert finished_runs(Path("outputs"), Path("captures/door.v1"), "splatart-pose") == [old, new]
 
 
 def test_a_run_that_was_killed_between_two_of_its_steps_is_not_finished(
@@ -84,14 +84,30 @@ def test_a_run_that_was_killed_between_two_of_its_steps_is_not_finished(
     method = Path("outputs/door/splatart-semantic")
     finished = write_run(method / "a", Path("door"))
     write_run(method / "b", Path("door"), saved_at=5)
-    assert finished_runs(Path("door"), "splatart-semantic") == [finished]
+    assert finished_runs(Path("outputs"), Path("door"), "splatart-semantic") == [finished]
+
+
+def test_a_run_whose_checkpoint_was_cut_off_is_not_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    method = Path("outputs/door/splatart-semantic")
+    finished, cut_off = write_run(method / "a", Path("door")), write_run(method / "b", Path("door"))
+    (file,) = cut_off.parent.glob("nerfstudio_models/*")
+    os.truncate(file, file.stat().st_size // 2)
+    assert finished_runs(Path("outputs"), Path("door"), "splatart-semantic") == [finished]
+
+
+def test_runs_are_looked_for_in_the_folder_that_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_run(Path("outputs/door/splatart-pose/a"), Path("door"))
+    elsewhere = write_run(Path("elsewhere/door/splatart-pose/a"), Path("door"))
+    assert finished_runs(Path("elsewhere"), Path("door"), "splatart-pose") == [elsewhere]
 
 
 def test_a_run_that_cannot_be_read_stands_in_no_other_runs_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     good = write_run(Path("outputs/door/splatart-pose/a"), Path("door"))
     write_run(Path("outputs/other/splatart-pose/b"), Path("other")).write_text("")
-    assert finished_runs(Path("door"), "splatart-pose") == [good]
+    assert finished_runs(Path("outputs"), Path("door"), "splatart-pose") == [good]
 
 
 def test_an_uncaught_input_error_ends_a_process_with_one_sentence() -> None:

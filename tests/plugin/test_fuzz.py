@@ -64,8 +64,8 @@ def test_any_config_of_a_run(run, tmp_path, data):
     config = one_sentence(read_run_config, run)
     assert config is None or isinstance(config, dict)
     one_sentence(run_setting, run, "pipeline", "datamanager", "dataparser", "state")
-    one_sentence(finished_runs, tmp_path / "capture", "splatart-semantic")
-    one_sentence(find_semantic_runs, tmp_path / "capture", 2)
+    one_sentence(finished_runs, tmp_path / "outputs", tmp_path / "capture", "splatart-semantic")
+    one_sentence(find_semantic_runs, tmp_path / "outputs", tmp_path / "capture", 2)
 
 
 @given(data=damaged_bytes(CHECKPOINT))

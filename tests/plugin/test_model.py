@@ -57,6 +57,12 @@ def test_a_bilateral_grid_is_refused() -> None:
         SplatartModelConfig(use_bilateral_grid=True).setup(scene_box=None, num_train_data=1, metadata={})
 
 
+@pytest.mark.parametrize("degree", [-1, 4])
+def test_spherical_harmonics_of_other_degrees_are_refused(degree: int) -> None:
+    with pytest.raises(InputError, match=f"sh-degree is {degree}; give 0 to 3"):
+        SplatartModelConfig(sh_degree=degree).setup(scene_box=None, num_train_data=1, metadata={})
+
+
 def test_metrics_that_are_not_computed_are_refused() -> None:
     with pytest.raises(InputError, match="color-corrected-metrics is True, .* leave it out"):
         SplatartModelConfig(color_corrected_metrics=True).setup(scene_box=None, num_train_data=1, metadata={})
@@ -104,6 +110,25 @@ def test_the_viewers_walk_over_all_attributes_finds_the_start_view(semantic_trai
     pipeline = semantic_trainer(capture_dir).pipeline
     assert parse_object(pipeline, ViewerElement, "Custom Elements") == []
     assert [control for _, control in parse_object(pipeline, ViewerControl, "")] == [pipeline.model.start_view]
+
+
+def test_an_object_alone_is_compared_with_opaque_images_within_its_rendered_silhouette(
+    semantic_trainer, capture_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trainer = semantic_trainer(capture_dir)
+    model = trainer.pipeline.model.eval()
+    camera, batch = eval_batch(trainer)
+    outputs = model.get_outputs_for_camera(camera)
+    opaque = {"image": torch.zeros(64, 64, 3)}
+    whole, _ = model.get_image_metrics_and_images(outputs, opaque)
+    assert "rendered_silhouette" not in whole  # object and surroundings are compared with all of the image
+    monkeypatch.setattr(type(model), "shows_surroundings", False)
+    for _ in range(2):
+        within, _ = model.get_image_metrics_and_images(outputs, opaque)
+    assert within["rendered_silhouette"] == 1 and within["psnr"] > whole["psnr"] + 3
+    assert capsys.readouterr().out.count("within its rendered silhouette") == 1
+    given, _ = model.get_image_metrics_and_images(outputs, batch)
+    assert given["rendered_silhouette"] == 0
 
 
 def test_rgba_over_the_background_is_the_rendered_image(semantic_trainer, capture_dir: Path) -> None:

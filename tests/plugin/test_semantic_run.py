@@ -1,5 +1,8 @@
 """Reading what stage 1 left."""
 
+import json
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -12,7 +15,22 @@ from splatart_ns.plugin.semantic_run import find_semantic_runs, learned_views
 def test_semantic_runs_that_are_not_there_are_named_by_state(capture_dir, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="--state 0` first, or name .* by --pipeline.semantic-runs"):
-        find_semantic_runs(capture_dir, 2)
+        find_semantic_runs(Path("outputs"), capture_dir, 2)
+
+
+def test_the_runs_chosen_are_told_and_what_their_settings_differ_in(tmp_path, capsys):
+    model = {"sh_degree": 1, "ssim_lambda": 0.2}
+    for state, sh_degree in ((0, 1), (1, 2)):
+        folder = tmp_path / "runs/door/splatart-semantic" / str(state)
+        (folder / "nerfstudio_models").mkdir(parents=True)
+        torch.save({}, folder / "nerfstudio_models/step-000000009.ckpt")
+        manager = {"data": [str(tmp_path)], "dataparser": {"state": state}, "seed": 0}
+        pipeline = {"datamanager": manager, "model": model | {"sh_degree": sh_degree}}
+        (folder / "config.yml").write_text(json.dumps({"max_num_iterations": 10, "pipeline": pipeline}))
+    runs = find_semantic_runs(tmp_path / "runs", tmp_path, 2)
+    first, second, warning = capsys.readouterr().out.splitlines()
+    assert (first, second) == (f"State 0: {runs[0]}", f"State 1: {runs[1]}")
+    assert warning.startswith("Warning: these runs had different settings (sh_degree), ")
 
 
 def test_views_are_seen_as_stage_1_left_them(capture_dir):
