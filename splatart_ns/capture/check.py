@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -13,7 +14,7 @@ import numpy as np
 from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame, Normalization, Problem, State
 from splatart_ns.capture.formats import read_capture
 from splatart_ns.capture.images import read_depth_for, read_image, read_labels, read_mask, read_silhouette, read_sized
-from splatart_ns.capture.label_steps import count_steps
+from splatart_ns.capture.label_steps import blurred_share, count_steps
 from splatart_ns.capture.view import load_points
 from splatart_ns.capture.worlds import OTHER_WORLDS_MEND, looks_elsewhere
 from splatart_ns.errors import InputError
@@ -79,8 +80,9 @@ _INVERTED = 0.9
 """Silhouettes are inverted if they leave out more than this share of all labelled pixels."""
 _BLURRED, _ENOUGH_STEPS = 0.3, 100
 """Labels are interpolated if more than this share of a state's steps, of which there are enough, leads over ids in
-between. In 72 captures it was at most 0.17 (tiny parts; 0.07 in all others), 0.22 halved by the nearest neighbour; at
-least 0.94 blurred by a pixel, 0.99 halved and enlarged, 0.52 enlarged by 1.5, 0.35 shrunk to 0.7, 0.40 halved by means.
+between (see `blurred_share`). In 72 captures it was at most 0.17 (tiny parts; 0.07 in all others), 0.22 halved by the
+nearest neighbour; at least 0.94 blurred by a pixel, 0.99 halved and enlarged, 0.52 enlarged by 1.5, 0.35 shrunk to 0.7,
+0.40 halved by means.
 """
 _NO_PIXELS = np.zeros(256, int)
 
@@ -92,7 +94,7 @@ class _Content:
     problems: list[Problem] = field(default_factory=list)
     pixels: np.ndarray = field(default_factory=lambda: _NO_PIXELS)
     """Number of pixels of each label [256]."""
-    steps: np.ndarray = field(default_factory=lambda: np.zeros(2, int))
+    steps: Counter[tuple[int, int, bool]] = field(default_factory=Counter)
     """Of the labels, by `count_steps`."""
     silhouette: float | None = None
     """The part of the image inside the silhouette, if the frame has one."""
@@ -199,10 +201,10 @@ def _check_silhouettes(capture: Capture, state: State, contents: list[_Content])
 
 def _check_steps(capture: Capture, state: State, contents: list[_Content]) -> Iterator[Problem]:
     """A warning, as a frame around a window may be a thin rim between other ids, too."""
-    direct, blurred = np.sum([content.steps for content in contents], axis=0)
-    steps = direct + blurred
-    if steps >= _ENOUGH_STEPS and blurred > _BLURRED * steps:
-        found = f"the labels seem to be resized or anti-aliased: {blurred / steps:.0%} of the outlines between ids two"
+    steps = sum((content.steps for content in contents), Counter())
+    share = blurred_share(steps)
+    if steps.total() >= _ENOUGH_STEPS and share > _BLURRED:
+        found = f"the labels seem to be resized or anti-aliased: {share:.0%} of the outlines between ids two"
         found += " or more apart are rims of ids in between"
         mend = "export them without anti-aliasing, and resize them by the nearest neighbour"
         yield Problem("warning", capture.path / state.name, found, mend)

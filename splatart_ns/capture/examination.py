@@ -382,20 +382,23 @@ def _same_images(a: State, b: State) -> bool:
 
 
 def _in_place(a: _Evidence, b: _Evidence, num_parts: int) -> Tensor:
-    """How much of each part [P + 1] of state a is at the same place in the labels of b, as a share of what is so in
-    those of a; NaN where few points are seen. What lies behind the surface of b may be there, hidden by a part that
-    moved before it, and does not count."""
-    part = a.votes.parts()
+    """How much of each part of state a is at the same place in the labels of b, as a share of what is so in those of a,
+    if what is not sure is elsewhere, and if it does not count: [2, P + 1]; NaN where few points are seen. What lies
+    behind the surface of b may be there, hidden by a part that moved before it, and does not count."""
+    own, others = a.votes.parts(), b.votes.parts()
     points, size = a.points_in(b)
     there = read_ballots(b.labelled, torch.cat([points, b.points]), max(size, b.size), num_parts)
-    right, number = torch.zeros(2, num_parts + 1), torch.zeros(2, num_parts + 1)
+    # What b shows in the place of a part lies on its own surface.
+    surface = (own, torch.cat([torch.zeros_like(own), others]))
+    parts = torch.cat([own, others])
+    right, number = torch.zeros(2, 1, num_parts + 1), torch.zeros(2, 2, num_parts + 1)
     for k, ballots in enumerate((a.votes.ballots, there)):
         for ballot in ballots:
-            own = ballot.points < len(points)
-            told = part[ballot.points[own]]
-            agrees = ballot.near[:, own][told, torch.arange(len(told))]
-            right[k] += torch.bincount(told, agrees.float(), num_parts + 1)
-            number[k] += torch.bincount(told, minlength=num_parts + 1)
+            part, seen = parts[ballot.points], ballot.points < len(own)
+            says, denies = ballot.verdict(part, surface[k])
+            right[k] += torch.bincount(part[says & seen], minlength=num_parts + 1)
+            number[k, 0] += torch.bincount(part[seen], minlength=num_parts + 1)
+            number[k, 1] += torch.bincount(part[(says | denies) & seen], minlength=num_parts + 1)
     share = right / number
     return torch.where((number >= _ENOUGH_POINTS).all(0), share[1] / share[0], math.nan)
 
@@ -404,10 +407,10 @@ def _check_motion(capture: Capture, first: _Evidence, other: _Evidence) -> Itera
     if first.votes is None or other.votes is None:
         return
     parts = list(capture.parts)
-    both = torch.stack([_in_place(first, other, max(parts)), _in_place(other, first, max(parts))])[:, parts]
+    both = torch.stack([_in_place(first, other, max(parts)), _in_place(other, first, max(parts))])[..., parts]
     # The less, as a part that comes out of another is seen where it was, but was not where it is seen.
-    rest = both.amin(0)
-    moved = both.nan_to_num(math.inf).amin(0)
+    rest = both[:, 0].amin(0)
+    moved = both[:, 1].nan_to_num(math.inf).amin(0)
     moved = moved[moved.isfinite()]
     place = capture.path / other.state.name
     if len(parts) > 1 and bool((rest > _STAYS).all()):

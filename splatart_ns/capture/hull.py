@@ -186,19 +186,50 @@ def project(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]
     return u.clamp(0, view.width - 1).long(), v.clamp(0, view.height - 1).long(), depth, inside
 
 
+@dataclass(frozen=True)
+class DepthBuffer:
+    """How voxels of a hull's surface lie before each other in a view, in cells as wide as a voxel."""
+
+    inside: Tensor
+    """Whether each falls into the image, bool [N]."""
+    depth: Tensor
+    """Along the optical axis [N]."""
+    cell: Tensor
+    """Which one it falls into [N], row by row."""
+    shape: tuple[int, int]
+    """Rows and columns of cells."""
+    tolerance: float
+    """How far behind another one a voxel may be seen: the surface is that rough."""
+
+    @classmethod
+    def of(cls, view: View, points: Tensor, size: float) -> DepthBuffer:
+        """Of voxels' centres [N, 3]."""
+        column, row, depth, inside = project(view, points)
+        middle = float(depth[inside].median()) if inside.any() else 1.0
+        cell = max(1, round(1.2 * size * float(view.K[0, 0]) / middle))
+        height, width = view.height // cell + 1, view.width // cell + 1
+        return cls(inside, depth, row // cell * width + column // cell, (height, width), 2.5 * size)
+
+    def nearest(self, those: Tensor) -> Tensor:
+        """The depth [N] of the first of `those` voxels (bool [N]) where each one is; infinite where there is none."""
+        first = torch.full((self.shape[0] * self.shape[1],), torch.inf)
+        those = those & self.inside
+        first.scatter_reduce_(0, self.cell[those], self.depth[those], "amin")
+        # The minimum over the neighbours closes the gaps between points.
+        return -F.max_pool2d(-first.reshape(1, *self.shape), 3, stride=1, padding=1).flatten()[self.cell]
+
+    def visible(self) -> Tensor:
+        """Which voxels the view sees, none before them: [N] bool; some by edges it does not."""
+        return self.inside & (self.depth < self.nearest(self.inside) + self.tolerance)
+
+    def as_near(self, those: Tensor) -> Tensor:
+        """Where one of `those` voxels (bool [N]) is before each one, or hardly behind it: [N] bool."""
+        return self.nearest(those) < self.depth + self.tolerance
+
+
 def visible(view: View, points: Tensor, size: float) -> Tensor:
     """Which voxels [N, 3] of a hull's surface a view sees, none before them: [N] bool; some by edges it does not."""
-    column, row, depth, inside = project(view, points)
-    if not inside.any():
-        return inside
-    # A depth buffer of cells as wide as a voxel; its minimum over the neighbours closes the gaps between points.
-    cell = max(1, round(1.2 * size * float(view.K[0, 0] / depth[inside].median())))
-    width, height = view.width // cell + 1, view.height // cell + 1
-    where = row // cell * width + column // cell
-    nearest = torch.full((height * width,), torch.inf)
-    nearest.scatter_reduce_(0, where[inside], depth[inside], "amin")
-    nearest = -F.max_pool2d(-nearest.reshape(1, 1, height, width), 3, stride=1, padding=1).flatten()
-    return inside & (depth < nearest[where] + 2.5 * size)
+    return DepthBuffer.of(view, points, size).visible()
 
 
 def footprint(view: View, size: float) -> int:

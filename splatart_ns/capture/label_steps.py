@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from itertools import repeat
+
 import numpy as np
 
 from splatart_ns.capture.capture import UNLABELLED
 
 
-def count_steps(labels: np.ndarray) -> np.ndarray:
-    """How often two ids that differ by two or more follow each other along rows and columns of labels [H, W]: int [2],
-    at once, and over one or two pixels of ids between them.
+def count_steps(labels: np.ndarray) -> Counter[tuple[int, int, bool]]:
+    """How often two ids that differ by two or more follow each other along rows and columns of labels [H, W]: by the
+    lower one, the higher one, and whether over one or two pixels of ids between them.
 
     Each must go on for three pixels: it is no rim of ids in between then.
     """
-    counts = np.zeros(2, int)
+    counts: Counter[tuple[int, int, bool]] = Counter()
     for rows in (labels, labels.T):
         y, x = np.nonzero(rows[:, 2:-5] != rows[:, 3:-4])
         ids = rows[y, x + np.arange(8)[:, None]]  # three pixels before a change, five after it
@@ -24,5 +27,19 @@ def count_steps(labels: np.ndarray) -> np.ndarray:
             apart = (high - low > 1) & (high != UNLABELLED)
             inside = ((low < between) & (between < high)).all(axis=0)
             goes_on = (after[1:] == after[0]).all(axis=0)
-            counts[min(width, 1)] += (apart & inside & goes_on).sum()
+            found = apart & inside & goes_on
+            counts.update(zip(low[found].tolist(), high[found].tolist(), repeat(width > 0)))
     return counts
+
+
+def blurred_share(steps: Counter[tuple[int, int, bool]]) -> float:
+    """How many of the steps lead over ids in between: of all, or of those between the ids of the middle step, which is
+    less. A part that is a rim between two others is so between these alone; interpolation leaves rims everywhere.
+    """
+    numbers = Counter[tuple[int, int]]()
+    for (low, high, _), number in steps.items():
+        numbers[low, high] += number
+    if not numbers:
+        return 0.0
+    shares = np.repeat([steps[*pair, True] / n for pair, n in numbers.items()], list(numbers.values()))
+    return float(min(shares.mean(), np.median(shares)))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splatart_ns.capture.hull import footprint, project, visible, widened
+from splatart_ns.capture.hull import DepthBuffer, footprint, project, widened
 from splatart_ns.capture.view import View
 
 _CLEAR = 0.66
@@ -25,6 +25,21 @@ class Ballot:
     """The label of the pixel each falls into [M]."""
     near: Tensor
     """Whether a label is there or within half a voxel's diagonal, bool [P + 1, M]."""
+    depths: DepthBuffer
+    """How all points of the surface lie before each other."""
+
+    def verdict(self, own: Tensor, parts: Tensor) -> tuple[Tensor, Tensor]:
+        """Which of the points that it sees, which are of parts `own` [M], the view says are so, and which it says are
+        not: bool [M] each. `parts` [N] are those of the whole surface.
+
+        A pixel nearby of the right label is enough. Where points of the part that it says are hardly further away, it
+        says nothing: parts may be thinner than a voxel, and the hull fills hollows between them.
+        """
+        right = self.near[own, torch.arange(len(own))]
+        unsure = torch.zeros_like(right)
+        for label in range(1, len(self.near)):
+            unsure |= self.near[label] & self.depths.as_near(parts == label)[self.points]
+        return right, ~right & ~unsure
 
 
 @dataclass(frozen=True)
@@ -47,21 +62,21 @@ class PartVotes:
         return PartVotes(counts, tuple(other for other in self.ballots if other is not ballot))
 
     def disagreement(self, ballot: Ballot) -> tuple[Tensor, Tensor]:
-        """Of the points of each part by the other views' votes, the share that a view says is another, and how many
-        they are: both [P + 1]. A pixel nearby of the right label is enough."""
-        others = self.counts[ballot.points]
-        others[torch.arange(len(others)), ballot.label] -= 1
-        part = _majority(others)
-        wrong = ~ballot.near[part, torch.arange(len(part))]
-        number = torch.bincount(part, minlength=self.counts.shape[1])
-        return torch.bincount(part, wrong.double(), self.counts.shape[1]) / number.clamp_min(1), number
+        """Of the points of each part by the other views' votes of which a view says anything, the share that it says is
+        another, and their number: both [P + 1]."""
+        parts = self.without(ballot).parts()
+        own = parts[ballot.points]
+        verdict = ballot.verdict(own, parts)
+        right, wrong = (torch.bincount(own[says], minlength=self.counts.shape[1]) for says in verdict)
+        return wrong / (right + wrong).clamp_min(1), right + wrong
 
 
 def read_ballots(views: Sequence[View], points: Tensor, size: float, num_parts: int) -> tuple[Ballot, ...]:
     """What labelled views say of voxels [N, 3] of a surface."""
     ballots = []
     for view in views:
-        index = torch.nonzero(visible(view, points, size)).flatten()
+        depths = DepthBuffer.of(view, points, size)
+        index = torch.nonzero(depths.visible()).flatten()
         column, row, _, _ = project(view, points[index])
         label = view.labels[row, column].long()
         known = label <= num_parts
@@ -70,7 +85,7 @@ def read_ballots(views: Sequence[View], points: Tensor, size: float, num_parts: 
         near = torch.zeros(num_parts + 1, len(index), dtype=torch.bool)
         for part in torch.unique(view.labels[view.labels <= num_parts]).tolist():
             near[part] = widened(view.labels == part, reach)[row, column]
-        ballots.append(Ballot(index, label, near))
+        ballots.append(Ballot(index, label, near, depths))
     return tuple(ballots)
 
 

@@ -381,7 +381,7 @@ class SemanticPipeline(VanillaPipeline):
         frames, labelled = self.datamanager.train_dataset.metadata["frames"], sorted(self._labelled)
         splat = self.model.splat.detach()
         votes, shown = ballots(splat, [self._views[i] for i in labelled], self.model.num_parts)
-        kept = trusted(votes)
+        kept = trusted(votes, shown)
         for i in (labelled[v] for v in (~kept).nonzero()[:, 0].tolist()):
             self.notes.append(f"{frames[i].labels}: contradicts the other frames' labels and is not used.")
             CONSOLE.log(self.notes[-1], markup=False)

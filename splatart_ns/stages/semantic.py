@@ -11,6 +11,7 @@ from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.view import View
 from splatart_ns.rasterize.render import Rendering, render
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.spread import TOLD
 from splatart_ns.stages.visibility import unobstructed
 
 WRONG_OBJECT = 0.6
@@ -86,12 +87,15 @@ def ballots(splat: Splat, views: Sequence[View], num_parts: int) -> tuple[Tensor
     return torch.stack(cast), torch.stack(shown)
 
 
-def trusted(votes: Tensor) -> Tensor:
-    """Which views' ballots [V, N, P + 1] do not contradict the others: bool [V].
+def trusted(votes: Tensor, shown: Tensor) -> Tensor:
+    """Which views' ballots [V, N, P + 1], with what they show of each Gaussian [V, N], do not contradict the others:
+    bool [V].
 
+    A glimmer of what lies behind a thin part has the part's label, and is no vote.
     The view goes that contradicts the others most, as long as one contradicts them on much of the object. Of fewer than
     three views nobody can tell which is wrong.
     """
+    votes = votes * (shown >= TOLD)[..., None]
     kept = torch.ones(len(votes), dtype=torch.bool, device=votes.device)
     while kept.sum() >= 3:
         total = votes[kept].sum(0)

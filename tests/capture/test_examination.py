@@ -12,6 +12,7 @@ from splatart_ns.capture.digest import capture_digest
 from splatart_ns.capture.examination import as_json, as_text, examine
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.procedural import synthesize_object
+from splatart_ns.capture.synthesis import synthesize
 from splatart_ns.capture.synthesis_options import SynthesisOptions
 
 
@@ -188,6 +189,26 @@ def test_a_frame_that_is_partly_wrong_is_named_where_many_silhouettes_make_a_sha
     change_png(capture / LABELS, swapped_at_the_left)
     problems = examine(capture).problems
     assert [p.file for p in problems] == [capture / LABELS], problems
+
+
+BOOK = """<robot name="book">
+<link name="back"><visual><origin xyz="0.08 0 0"/><geometry><box size="0.16 0.22 0.02"/></geometry></visual></link>
+<link name="cover"><visual><origin xyz="0.081 0 0"/><geometry><box size="0.162 0.222 0.004"/></geometry></visual></link>
+<joint name="hinge" type="revolute"><parent link="back"/><child link="cover"/><origin xyz="0 0 0.0135"/>
+<axis xyz="0 -1 0"/><limit lower="0" upper="3.1" effort="1" velocity="1"/></joint>
+</robot>"""
+
+
+def test_a_lid_thinner_than_the_hull_can_tell_makes_neither_labels_nor_worlds_seem_wrong(tmp_path):
+    (tmp_path / "book.urdf").write_text(BOOK)
+    options = SynthesisOptions(
+        joint_values=("hinge=0", "hinge=2.9"), train_views=16, test_views=2, resolution=96, labelled_fraction=0.25
+    )
+    capture = synthesize(tmp_path / "book.urdf", tmp_path / "capture", options)
+    assert examine(capture).problems == ()
+    labels = sorted((capture / "state_01/semantics").iterdir())[1]
+    change_png(labels, swapped)
+    assert [p.file for p in examine(capture).problems] == [labels]
 
 
 def test_a_sound_capture_has_no_problems_and_its_parts_are_counted(hinge_capture):

@@ -89,7 +89,7 @@ def swapped(view):
 @pytest.mark.parametrize("wrong", [{3}, {1, 5, 6}])
 def test_views_that_contradict_the_others_are_not_trusted(wrong):
     views = [swapped(view) if i in wrong else view for i, view in enumerate(VIEWS[:9])]
-    kept = trusted(ballots(SPLAT, views, 2)[0])
+    kept = trusted(*ballots(SPLAT, views, 2))
     assert {i for i, keep in enumerate(kept.tolist()) if not keep} == wrong
 
 
@@ -99,9 +99,17 @@ def test_right_labels_are_trusted_even_if_their_outlines_are_rough():
     for view in VIEWS:
         shift = torch.randint(-1, 2, (2,), generator=g).tolist()
         rough.append(replace(view, labels=view.labels.roll(shift, (0, 1))))
-    assert trusted(ballots(SPLAT, rough, 2)[0]).all()
+    assert trusted(*ballots(SPLAT, rough, 2)).all()
 
 
 def test_of_two_views_none_is_called_wrong():
-    assert trusted(ballots(SPLAT, [VIEWS[4], swapped(VIEWS[5])], 2)[0]).all()
-    assert trusted(ballots(SPLAT, [], 2)[0]).shape == (0,)
+    assert trusted(*ballots(SPLAT, [VIEWS[4], swapped(VIEWS[5])], 2)).all()
+    assert trusted(*ballots(SPLAT, [], 2)).shape == (0,)
+
+
+def test_right_labels_from_behind_are_trusted_though_others_see_a_glimmer_through_what_lies_before():
+    book = Splat.cat([box(1, (0.9, 0.6, 0.06), (0.0, 0.0, 0.0)), box(2, (0.9, 0.6, 0.06), (0.0, 0.0, 0.12))])
+    all_around = photograph(book, 100)
+    *above, below = (all_around[k] for k in (0, 1, 2, 99))
+    assert trusted(*ballots(book, [*above, below], 2)).all()
+    assert trusted(*ballots(book, [*above, swapped(below)], 2)).tolist() == [True, True, True, False]
