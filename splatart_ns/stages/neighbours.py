@@ -1,8 +1,8 @@
 """Parts that turn as what they touch lets them: where the images accept several motions, a joint is what decides.
 
 A button, a knob or a lampshade looks alike turned over, and what no view of its own state shows, or the light, may even
-make it fit better so. But a joint seldom turns a part by more than a right angle against what it hangs on: only where
-none does by less is one believed to do so by more, about a hinge along its rim, as lids have it.
+make it fit better so. But a joint seldom turns a part by more than a right angle against what it hangs on: that is
+believed only where what fits best turns it about a line beside the object.
 """
 
 from __future__ import annotations
@@ -28,11 +28,8 @@ TOUCHING, NO_NEARER = 0.03, 1.5
 many times as near as any other part: what joins them may not show."""
 NEAR = 0.1
 """A hinge passes by both parts no further away than this, added up, and shifts none by more."""
-RIM = 0.1
-"""Of a part with a hinge along its rim a smaller share lies beyond it."""
-ENOUGH = 200
-"""Gaussians of a part whose turns can be told: a gripper's finger of 64 that slid seemed to turn by 6 degrees,
-or, turned over, by 167 about its rim."""
+FAR = 1.0
+"""A line that passes by further away is no hinge, however little of a motion is known: it lies beside the object."""
 
 
 def turned_as_neighbours_let(
@@ -90,9 +87,11 @@ def _jointed(
     its front may touch other drawers alone. One that makes joints with several goes first: a hip moves against the body
     and the leg. The motion itself if none makes any; `fixed` and `rest` are motions [4, 4]. And how many it makes."""
 
-    def joints(T: Tensor, wide: bool = False) -> int:
-        """With how much of what moves, and with what rests, which counts as one."""
-        against = {q: parts.may_be_jointed(part, q, inverse(T_q) @ T, wide) for q, T_q in {**rest, **fixed}.items()}
+    told = {**rest, **fixed}
+
+    def joints(T: Tensor, most: float = TURNED_OVER) -> int:
+        """With how much of what moves, and with what rests, which counts as one; turned by `most` at most."""
+        against = {q: parts.may_be_jointed(part, q, inverse(T_q) @ T, most) for q, T_q in told.items()}
         return any(against[q] for q in rest) + sum(against[q] for q in fixed.keys() - rest.keys())
 
     choices = [motion.T, *motion.alike]
@@ -103,8 +102,8 @@ def _jointed(
         turned = turned[[joints(T) > 0 for T in turned]]
         choices += alike_in_even_light(splats, views, part, motion.T, turned)
     made = [joints(T) for T in choices]
-    if not any(made) and min(int((splat.part_ids == part).sum()) for splat in splats) >= ENOUGH:
-        made = [joints(T, wide=True) for T in choices]
+    if not any(made) and all(parts.turns_afar(part, q, inverse(T_q) @ motion.T) for q, T_q in told.items()):
+        made = [joints(T, math.pi) for T in choices]  # a lid may open by more than a right angle
     best = made.index(max(made))
     chosen = replace(motion, T=choices[best], alike=tuple(T for i, T in enumerate(choices) if i != best))
     return chosen, made[best]
@@ -143,21 +142,25 @@ class _Parts:
         others = self.near[part] & motions.keys()
         return any(self.may_be_jointed(part, q, inverse(motions[q]) @ motions[part]) for q in others)
 
-    def may_be_jointed(self, a: int, b: int, T: Tensor, wide: bool = False) -> bool:
-        """Whether T [4, 4], by which part a moves against part b, slides it or turns it about a hinge of both, but not
-        over; if `wide`, by any angle about a hinge along its rim: what slid a little and looks turned over seems to
-        have turned about a line through its middle."""
+    def may_be_jointed(self, a: int, b: int, T: Tensor, most: float = TURNED_OVER) -> bool:
+        """Whether T [4, 4], by which part a moves against part b, slides it or turns it about a hinge of both, by
+        `most` at most."""
         turn = _turn(T)
         if turn < math.radians(SLIDE_TURN):
             return True
+        apart, slide = self._hinge(a, b, T)
+        return turn <= most and apart < NEAR and slide < NEAR
+
+    def turns_afar(self, a: int, b: int, T: Tensor) -> bool:
+        """Whether T [4, 4], by which part a moves against part b, turns it about a line beside the object."""
+        return _turn(T) >= math.radians(SLIDE_TURN) and self._hinge(a, b, T)[0] > FAR
+
+    def _hinge(self, a: int, b: int, T: Tensor) -> tuple[float, float]:
+        """How far from both parts the line lies about which T turns part a against part b, and by how much it shifts it
+        along that."""
         contact = self.contacts[min(a, b), max(a, b)]
         screw = screw_from_motion(T, contact.points.mean(0))
-        apart = contact.distance_to_axis(screw.axis, screw.point, through_holes=False)
-        if apart >= NEAR or abs(float(screw.slide)) >= NEAR:
-            return False
-        across = contact.parts[a > b] - screw.point
-        across = across - (across @ screw.axis)[:, None] * screw.axis
-        return turn <= TURNED_OVER or wide and float((across @ across.mean(0) < 0).double().mean()) < RIM
+        return contact.distance_to_axis(screw.axis, screw.point, through_holes=False), abs(float(screw.slide))
 
 
 def _turn(T: Tensor) -> float:
