@@ -39,9 +39,8 @@ from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_exte
 from splatart_ns.stages.reference import is_sure, reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import InitialMotion, initial_motion
 from splatart_ns.stages.siblings import slid_alike, slide_ways
-from splatart_ns.stages.symmetry import UNTURNED
 from splatart_ns.stages.thinning import BUDGET, MAX_VIEWS, ROUNDS, absences, expendable
-from splatart_ns.stages.unseen import may_have_turned
+from splatart_ns.stages.unseen import may_have_turned, unturned
 from splatart_ns.stages.visibility import HIDDEN, looked_at
 from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_views, world_record, world_sentence
 
@@ -300,7 +299,7 @@ class PosePipeline(VanillaPipeline):
         Of those that refinement has neither turned nor slid, from poses `held` to T [S, P, 4, 4], and whose covariances
         [S, P, 6, 6] leave no turn open.
         """
-        turned = so3_log((inverse(held) @ T)[..., :3, :3]).norm(dim=-1) > math.radians(UNTURNED)
+        turned = ~unturned(inverse(held) @ T)
         slid = self._frozen.to(T.device) & ~torch.isclose(T, held).flatten(2).all(-1)
         stayed = ~(turned | slid | may_have_turned(covariance))
         doubtful = self._maybe_moved & stayed.cpu()

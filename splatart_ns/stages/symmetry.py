@@ -29,6 +29,7 @@ from splatart_ns.stages.part_pair import CHROMA_WEIGHT, PartPair, part_pair
 from splatart_ns.stages.refinement import normal_equations, refine
 from splatart_ns.stages.render_choice import COARSE_PIXELS, DOUBTFUL_VIEWS, VIEWS
 from splatart_ns.stages.symmetric_turns import similar_axes
+from splatart_ns.stages.unseen import unturned
 
 MAYBE_ROUND = 0.03
 """Turning them about their principal axis raises the cost per pixel by less than this."""
@@ -73,8 +74,6 @@ the worst of all turns costs more: what is lit from one side costs (1 - cos 30 d
 parts that rest 5.5 to 13 and 0.38 to 0.56, nine wheels 1.2 and 0.07 at most."""
 TOLD_SHARE = 0.05
 """And by this share of what the worst costs more: else it may be light, whose wide dips measured 0.02 at most."""
-UNTURNED = 5
-"""Degrees by which a part that turned about its axis of symmetry alone may seem to have turned about others."""
 
 
 def settle_turn(
@@ -105,7 +104,7 @@ def settle_turn(
         return T, untold
     pair = replace(look(VIEWS), chroma_weight=CHROMA_WEIGHT)
     axes = T.new_zeros(0, 3)
-    rests = so3_log(T[:3, :3]).norm() < math.radians(UNTURNED)
+    rests = unturned(T)
     moved = transform_points(T, pair.centroid[None])[0] - pair.centroid
     stays = bool(rests and moved.norm() < UNMOVED * pair.radius)
     unseen, shares, weights = _unseen_turns(pair, T, stays) if rests else (T.new_zeros(0, 6), *T.new_zeros(2, 0))
@@ -129,7 +128,7 @@ def settle_turn(
         if not told:
             untold = untold + math.pi**2 / 3 * twist.outer(twist)
             back = se3_exp(_least_turn(T, twist) * twist) @ T
-            T = back if so3_log(back[:3, :3]).norm() < math.radians(UNTURNED) else T
+            T = back if unturned(back) else T
         elif abs(math.remainder(angle, 2 * math.pi)) > math.radians(DIP + 0.5 * STEP):
             T = se3_exp(angle * twist) @ T
     return T, untold

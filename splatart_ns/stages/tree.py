@@ -33,7 +33,7 @@ from splatart_ns.stages.joint_fit import JointFit, free_joint
 from splatart_ns.stages.joint_pairs import descend_pairs, fit_pairs, stood_still, surface_error, told_pair
 from splatart_ns.stages.tree_reasons import exchange_hint, fits_far_worse, why_contradicted, why_unattached
 from splatart_ns.stages.tree_refinement import refine_tree
-from splatart_ns.stages.unseen import as_seen, known_states, leads_blindly, may_have_turned, place_unseen, rests
+from splatart_ns.stages.unseen import as_seen, known_states, leads_blindly, may_have_turned, place_unseen, unturned
 from splatart_ns.stages.unseen_turn import turned_unseen
 
 JointMethod = Literal["screw", "descent"]
@@ -122,7 +122,7 @@ def infer_tree(
     if covariances is not None and stood_still(root, motions):
         # If it turned unseen, so did all that hangs on it.
         covariances = covariances | {root: 0 * covariances[root]}
-    elif covariances is not None and rests(motions[root]):
+    elif covariances is not None and bool(unturned(motions[root]).all()):
         covariances = covariances | {root: as_seen(covariances[root])}
     floor = noise if covariances is None else _SEEN_NOISE * noise
     certainty = {"covariances": covariances, "noise": floor, "epsilon": epsilon}

@@ -17,8 +17,8 @@ from splatart_ns.geometry.se3 import inverse, so3_log
 from splatart_ns.stages.articulate import KinematicTree
 from splatart_ns.stages.joint_fit import UNSEEN_ROTATION
 
-UNTURNED = 5
-"""Degrees by which a part that rests is turned at most."""
+_UNTURNED = 5
+"""Degrees by which a part that did not turn, or about its axis of symmetry alone, may seem to have turned."""
 
 
 def known_states(motions: Mapping[int, Tensor], covariances: Mapping[int, Tensor] | None) -> dict[int, Tensor]:
@@ -34,9 +34,9 @@ def may_have_turned(covariances: Tensor) -> Tensor:
     return torch.linalg.eigvalsh(rotation)[..., -1] > UNSEEN_ROTATION**2
 
 
-def rests(T: Tensor) -> bool:
-    """Whether motions T [S, 4, 4] hardly turn a part: by less than what refining leaves of those that rest."""
-    return bool((so3_log(T[..., :3, :3]).norm(dim=-1) < math.radians(UNTURNED)).all())
+def unturned(T: Tensor) -> Tensor:
+    """Which motions T [..., 4, 4] hardly turn a part: bool [...]."""
+    return so3_log(T[..., :3, :3]).norm(dim=-1) < math.radians(_UNTURNED)
 
 
 def as_seen(covariances: Tensor) -> Tensor:
