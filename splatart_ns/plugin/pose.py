@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import random
 import time
 from collections.abc import Iterator
@@ -24,7 +23,6 @@ from splatart_ns.bundle.motion_file import read_motions
 from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.view import View
 from splatart_ns.errors import InputError
-from splatart_ns.geometry.se3 import inverse, so3_log
 from splatart_ns.plugin.gaussians import gauss_params_from_splat
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig, refuse_unread
 from splatart_ns.plugin.semantic_run import find_semantic_runs, read_state
@@ -33,14 +31,13 @@ from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.flush import border_against_others
 from splatart_ns.stages.merge import merge_parts
-from splatart_ns.stages.motion_preference import OTHERWISE
 from splatart_ns.stages.neighbours import turned_as_neighbours_let
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
+from splatart_ns.stages.pose_notes import doubtful_rest, open_turns, turns_alike, unknown_poses
 from splatart_ns.stages.reference import is_sure, reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import InitialMotion, initial_motion
 from splatart_ns.stages.siblings import slid_alike, slide_ways
 from splatart_ns.stages.thinning import BUDGET, MAX_VIEWS, ROUNDS, absences, expendable
-from splatart_ns.stages.unseen import may_have_turned, unturned
 from splatart_ns.stages.visibility import HIDDEN, looked_at
 from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_views, world_record, world_sentence
 
@@ -56,8 +53,6 @@ MOST = 3.0
 """So many standard deviations at most these poses move: light counts in that loss, and leads them astray."""
 WELL_KNOWN = 0.01
 """Their largest standard deviation, in radians and radii: others would be led by single views."""
-FEW = 4
-"""Of more turns that look alike a note says how many there are, and within which bounds."""
 
 
 @dataclass
@@ -221,8 +216,7 @@ class PosePipeline(VanillaPipeline):
             self.model.worlds[k] = to_first.to(self.model.worlds) @ self.model.worlds[k]
             told = world_record(capture.states[k].name, self.model.part_names[part], self.model.worlds[k], fit)
             self.findings["worlds"].append(told)
-            self.notes.append(world_sentence(told, capture.states[0].name))
-            CONSOLE.log(self.notes[-1], markup=False)
+            self._note([world_sentence(told, capture.states[0].name)])
 
     def _initial_poses(self, splats: list[Splat]) -> Tensor:
         """Poses [S, P, 4, 4] to begin from; keeps in mind the reference states, and what is known and what stays."""
@@ -261,68 +255,13 @@ class PosePipeline(VanillaPipeline):
                     self._alike[s, p] = motion
         return since_state_0(M, self._known)
 
-    def _note_alike(self, T: Tensor, covariance: Tensor) -> None:
-        """Say by which turns other than those of the poses T [S, P, 4, 4] the images show a part as well, and mark it
-        for `doubted`.
-
-        Of those whose covariances [S, P, 6, 6] leave the turn open, `_note_turned` says enough.
-        """
-        open_turns = may_have_turned(covariance)
-        for (s, p), motion in self._alike.items():
-            found = (T[s, p] @ inverse(T[self._reference[p], p])).to(motion.T)
-            # The turn that the search ended at is another one where refinement left it.
-            others = [
-                round(math.degrees(so3_log(X[:3, :3]).norm()))
-                for X in (*motion.alike, motion.T)
-                if so3_log(found[:3, :3].mT @ X[:3, :3]).norm() > OTHERWISE / 2
-            ]
-            if not others:
-                continue
-            self.model.alike[p] = True
-            if open_turns[s, p]:
-                continue
-            others = list(dict.fromkeys(others))
-            few = " or ".join(map(str, others))
-            by = few if len(others) <= FEW else f"{len(others)} others of {min(others)} to {max(others)}"
-            turn = round(math.degrees(so3_log(found[:3, :3]).norm()))
-            rests = torch.allclose(found, torch.eye(4).to(found))
-            how = f"turned by {turn} degrees; by {by}"
-            if not turn:
-                how = f"{'rests' if rests else 'slid'}; turned by {by} degrees"
-            part = f"part {self.model.part_names[p + 1]}, state {s}"
-            self.notes.append(f"{part}: {how} it looks nearly the same.")
-            CONSOLE.log(self.notes[-1], markup=False)
-
-    def _note_resting(self, held: Tensor, T: Tensor, covariance: Tensor) -> None:
-        """Say of which parts it is in doubt whether they rest, and mark them for `doubted`.
-
-        Of those that refinement has neither turned nor slid, from poses `held` to T [S, P, 4, 4], and whose covariances
-        [S, P, 6, 6] leave no turn open.
-        """
-        turned = ~unturned(inverse(held) @ T)
-        slid = self._frozen.to(T.device) & ~torch.isclose(T, held).flatten(2).all(-1)
-        stayed = ~(turned | slid | may_have_turned(covariance))
-        doubtful = self._maybe_moved & stayed.cpu()
-        self.model.alike |= doubtful.any(0).to(self.model.alike)
-        for s, p in doubtful.nonzero().tolist():
-            part = f"part {self.model.part_names[p + 1]}, state {s}"
-            self.notes.append(f"{part}: seems to rest, but other motions fit its images a little better.")
-            CONSOLE.log(self.notes[-1], markup=False)
-
-    def _note_unknown(self, known: Tensor) -> None:
-        """Say which poses [S, P] of a part no image tells."""
-        for s, p in (~known).nonzero().tolist():
-            part = f"part {self.model.part_names[p + 1]}, state {s}"
-            put = "it is put where another state shows it" if s == 0 else "it moves as what it hangs on"
-            self.notes.append(f"{part}: the images show too little of it to find its pose; {put}.")
-            CONSOLE.log(self.notes[-1], markup=False)
-
-    def _note_turned(self, covariance: Tensor) -> None:
-        """Say of which parts covariances [S, P, 6, 6] leave the turn open."""
-        for s, p in may_have_turned(covariance).nonzero().tolist():
-            part = f"part {self.model.part_names[p + 1]}, state {s}"
-            self.notes.append(f"{part}: the images do not tell how far it turned about its own axis.")
-            CONSOLE.log(self.notes[-1], markup=False)
+    def _note(self, notes: list[str], in_doubt: Tensor | None = None) -> None:
+        """Keep and say notes, and mark the parts [P] of which they are in doubt for stage 3."""
+        self.notes += notes
+        for note in notes:
+            CONSOLE.log(note, markup=False)
+        if in_doubt is not None:
+            self.model.alike |= in_doubt.to(self.model.alike)
 
     def _poses_from_file(self) -> Tensor:
         if self.config.init_file is None:
@@ -454,10 +393,11 @@ class PosePipeline(VanillaPipeline):
         model.poses.commit(T)
         model.poses.release(self._learning_along(splats), model.covariance[..., 3:, 3:].flatten(2).any(-1))
         known = model.covariance.isfinite().flatten(2).all(-1)
-        self._note_unknown(known)
-        self._note_turned(model.covariance)
-        self._note_alike(T, model.covariance)
-        self._note_resting(begun, T, model.covariance)
+        parts = model.part_names[1:]
+        self._note(unknown_poses(known, parts))
+        self._note(open_turns(model.covariance, parts))
+        self._note(*turns_alike(self._alike, self._reference, T, model.covariance, parts))
+        self._note(*doubtful_rest(self._maybe_moved, self._frozen, begun, T, model.covariance, parts))
         merged = Splat.cat(merge_parts(splats, self.views, T, known, self._seen if as_begun else None))
         params = gauss_params_from_splat(merged)
         for name, parameter in params.items():
