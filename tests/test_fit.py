@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -95,7 +96,10 @@ def test_the_report_tells_what_every_stage_took(hinge_fit):
     assert report["seconds"] == pytest.approx(sum(stage["wall_seconds"] for stage in report["stages"]), abs=0.01)
     assert report["settings"] == SETTINGS
     assert {"python", "torch", "nerfstudio", "splatart-ns"} <= set(report["versions"])
-    thinned = report["stages"][STAGES.index("pose")]["thinned"]
+    pose = report["stages"][STAGES.index("pose")]
+    assert [state["state"] for state in pose["images"]] == ["state_00", "state_01"]
+    assert all(24 < state["psnr"] < 60 for state in pose["images"])
+    thinned = pose["thinned"]
     assert thinned["gaussians"][0] > thinned["gaussians"][1] == report["stages"][-1]["gaussians"]
     assert report["stages"][-1]["gaussians"] == sum(len(part.splat) for part in load_bundle(hinge_fit).parts)
 
@@ -147,10 +151,15 @@ def test_an_interrupted_fit_ends_like_an_uninterrupted_one(hinge_fit, hinge_capt
     assert results(bundle) == results(hinge_fit)
 
 
-def test_a_finished_fit_is_left_alone(fit_copy, hinge_capture, run_main):
+def test_a_finished_fit_is_left_alone_and_told_again(fit_copy, hinge_capture, run_main):
     before = contents(fit_copy)
-    assert run_main("fit", hinge_capture, "--output-dir", fit_copy, "--quality", "draft")[0] == 0
-    assert contents(fit_copy) == before
+    code, told, _ = run_main("fit", hinge_capture, "--output-dir", fit_copy, "--quality", "draft")
+    assert code == 0 and contents(fit_copy) == before
+    *_, root, lid, error, bundle, config = told.splitlines()
+    assert root == "base: the root" and lid.startswith("  lid: revolute on base, axis ± ") and "degree" in lid
+    report = json.loads((fit_copy / "report.json").read_text())
+    assert error.startswith("PSNR of training images: state_00 ") and error.endswith(f" dB; {report['seconds']:.0f} s")
+    assert bundle == f"Bundle: {fit_copy}" and Path(config.removeprefix("Config: ")).exists()
 
 
 def test_a_finished_fit_is_left_alone_however_its_capture_is_spelled(fit_copy, hinge_capture, run_main, monkeypatch):

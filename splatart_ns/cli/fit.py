@@ -52,4 +52,4 @@ class Fit:
 
             choose_rasterizer(self.rasterizer)
             how = (self.quality, self.root, self.seed, self.rasterizer, self.joint, self.worlds, self.refine_cameras)
-            print(f"Bundle: {fit(self.capture, self.output_dir, *how, companions)}")
+            fit(self.capture, self.output_dir, *how, companions)

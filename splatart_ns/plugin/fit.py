@@ -13,6 +13,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from splatart_ns.bundle import load_bundle
+from splatart_ns.bundle.description import describe
 from splatart_ns.capture.capture import Problem
 from splatart_ns.capture.values import is_inside
 from splatart_ns.choices import Quality, Rasterizer, RefineCameras, Worlds
@@ -43,7 +44,7 @@ def fit(
     refine_cameras: RefineCameras = "auto",
     companions: Companions | None = None,
 ) -> Path:
-    """Run what is missing of all stages and leave the bundle in `output_dir`.
+    """Run what is missing of all stages, leave the bundle in `output_dir` and say what it holds.
 
     `companions` may have been started before this module was imported, which takes them as long as this process.
 
@@ -72,6 +73,9 @@ def fit(
             _train(configs, rasterizer, report, progress, companions)
             _train({"pose": pose}, rasterizer, report, progress)
             _train({"joint": joint}, rasterizer, report, progress, whole=_is_whole(output_dir))
+    told = [*describe(load_bundle(output_dir)), report.summary]
+    told += [f"Bundle: {output_dir}", f"Config: {joint.get_base_dir() / 'config.yml'}"]
+    CONSOLE.print("\n".join(told), markup=False, highlight=False, soft_wrap=True)
     return output_dir
 
 

@@ -19,6 +19,7 @@ from torch.nn.functional import pad
 
 from splatart_ns.bundle.assemble import assemble_bundle
 from splatart_ns.bundle.bundle import Bundle
+from splatart_ns.bundle.description import describe
 from splatart_ns.bundle.folder import save_bundle
 from splatart_ns.bundle.sliders import freedoms, slider_range, unit_name
 from splatart_ns.bundle.vantage import vantage_points
@@ -386,7 +387,8 @@ class JointTrainer(StageTrainer):
         with errors_of_saving(self.checkpoint_dir):
             save_bundle(self.pipeline.bundle, folder)
             self.save_checkpoint(self.step)
-        print(f"Bundle: {folder}\nConfig: {self.base_dir / 'config.yml'}")  # CONSOLE breaks lines
+        told = [*describe(self.pipeline.bundle), f"Bundle: {folder}", f"Config: {self.base_dir / 'config.yml'}"]
+        CONSOLE.print("\n".join(told), markup=False, highlight=False, soft_wrap=True)
         self._init_viewer_state()
         self.pipeline.eval()
         if not self.config.viewer.quit_on_train_completion:

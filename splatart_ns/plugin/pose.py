@@ -30,10 +30,11 @@ from splatart_ns.plugin.trainer import LaterPipelineConfig
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.flush import border_against_others
+from splatart_ns.stages.image_error import image_error
 from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.neighbours import turned_as_neighbours_let
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
-from splatart_ns.stages.pose_notes import doubtful_rest, open_turns, turns_alike, unknown_poses
+from splatart_ns.stages.pose_notes import doubtful_rest, ill_shown, open_turns, turns_alike, unknown_poses
 from splatart_ns.stages.reference import is_sure, reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import InitialMotion, initial_motion
 from splatart_ns.stages.siblings import slid_alike, slide_ways
@@ -183,6 +184,7 @@ class PosePipeline(VanillaPipeline):
         self.model.worlds = torch.from_numpy(np.stack([state.placement for state in capture.states])).to(device)
         if capture.worlds != "shared":
             self._bring_together(splats, capture)
+        self._shown = [image_error(splat, views) for splat, views in zip(splats, self.views, strict=True)]
         S, P = len(splats), self.model.num_parts
         self._reference, self._known, self._frozen = [0] * P, torch.ones(S, P, dtype=torch.bool), torch.zeros(S, P) > 0
         self._maybe_moved = torch.zeros(S, P) > 0
@@ -366,6 +368,7 @@ class PosePipeline(VanillaPipeline):
         def finish(step: int) -> None:
             if step == steps - 1:
                 self.model.poses.commit(self.model.poses.T())
+                self._tell_errors()
 
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
@@ -461,6 +464,16 @@ class PosePipeline(VanillaPipeline):
             absence[shown] += missed
             error += had
         return absence, error
+
+    def _tell_errors(self) -> None:
+        """How well the images of each state are shown in the end."""
+        model, states = self.model, [state.name for state in self.datamanager.capture.states]
+        T = model.poses.T().detach()
+        posed = [image_error(model.splat_at(s, T).detach(), views) for s, views in enumerate(self.views)]
+        self.findings["images"] = [
+            {"state": name, "psnr": round(x, 2)} for name, (x, _) in zip(states, posed, strict=True)
+        ]
+        self._note(*ill_shown(self._shown, posed, states, model.part_names[1:]))
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         return {**super().get_param_groups(), "part_poses": list(self.model.poses.parameters())}

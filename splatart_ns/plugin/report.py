@@ -24,6 +24,7 @@ from splatart_ns.rasterize.rasterization import default_backend, default_device
 from splatart_ns.shape import NUMBER, has_shape, parse
 
 _REPORT = {"stages": [{"name": str, "seconds": NUMBER}], "settings": dict, "versions": dict}
+_IMAGES = [{"state": str, "psnr": NUMBER}]
 _CAPTURE = ("capture", "capture_sha256")
 """Where it lies, and what it holds: it may be moved, or changed, and is another one if both differ."""
 TRAINED_ON = ("device", "rasterizer")
@@ -107,8 +108,21 @@ class Report:
         self._last = now
         self._write()
 
+    @property
+    def summary(self) -> str:
+        """Error and time of a finished fit."""
+        images = next((stage.get("images") for stage in self.data["stages"] if stage["name"] == "pose"), None)
+        told = f"{self._seconds():.0f} s"
+        if has_shape(images, _IMAGES):  # of an earlier run there may be none
+            shown = ", ".join(f"{of['state']} {of['psnr']:.1f}" for of in images)
+            told = f"PSNR of training images: {shown} dB; {told}"
+        return told
+
+    def _seconds(self) -> float:
+        return sum(stage["wall_seconds"] for stage in self.data["stages"])
+
     def _write(self) -> None:
-        self.data["seconds"] = round(sum(entry["wall_seconds"] for entry in self.data["stages"]), 2)
+        self.data["seconds"] = round(self._seconds(), 2)
         write_json(self.path, self.data)
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import re
 
 import viser
 
-from splatart_ns.bundle.bundle import Bundle, Joint
+from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.configurations import Configuration
-from splatart_ns.bundle.joint_axis import direction_deviation
+from splatart_ns.bundle.description import describe_joint, describe_part, part_depths
 from splatart_ns.bundle.sliders import bundle_sliders, configuration, positions
 
 _LINE = 36
@@ -24,7 +23,6 @@ class Panel:
         gui = server.gui
         # It keeps its share button, without which viser 0.2.7 shows an empty page.
         gui.configure_theme(control_layout="collapsible", show_logo=False)
-        joints = {joint.child: joint for joint in bundle.tree_joints}
         hints = {joint.name: describe_joint(joint) for joint in bundle.tree_joints}
         self._freedoms = bundle_sliders(bundle)
         self.sliders: list[viser.GuiInputHandle[float]] = []
@@ -38,8 +36,7 @@ class Panel:
             self.reset = gui.add_button("Reset", hint="All joints as in state 0")
             self.sweep = gui.add_checkbox("Sweep", False, hint="One joint after the other over its range")
         self.parts: dict[str, viser.GuiInputHandle[bool]] = {}
-        self._told = {name: "hangs on nothing" for name in bundle.part_names} | {bundle.root: "the root"}
-        self._told |= {name: describe_joint(joint) for name, joint in joints.items()}
+        self._told = {name: describe_part(bundle, name) for name in bundle.part_names}
         self._selected: str | None = None
         with gui.add_folder("Parts"):
             gui.add_markdown(f"```\n{tree_text(bundle)}\n```")
@@ -84,34 +81,11 @@ class Panel:
         return {name for name, switch in self.parts.items() if not switch.value}
 
 
-def part_depths(bundle: Bundle) -> list[tuple[str, int]]:
-    """All parts, each followed by those that hang on it, with the number of joints between it and the root."""
-    children: dict[str, list[str]] = {}
-    for joint in bundle.tree_joints:
-        children.setdefault(joint.parent, []).append(joint.child)
-    found, left = [], [(bundle.root, 0)]
-    while left:
-        name, depth = left.pop()
-        found.append((name, depth))
-        left += [(child, depth + 1) for child in reversed(children.get(name, []))]
-    hung = {name for name, _ in found}
-    return found + [(name, 0) for name in bundle.part_names if name not in hung]
-
-
 def tree_text(bundle: Bundle) -> str:
     """A line a part, indented under what it hangs on. Nothing in a name can end a block of code."""
     lines = [max(depth - 1, 0) * " " + ("└ " if depth else "") + _plain(name) for name, depth in part_depths(bundle)]
     # A longer line would make the panel wider than the browser shows it.
     return "\n".join(line if len(line) <= _LINE else line[: _LINE - 1] + "…" for line in lines)
-
-
-def describe_joint(joint: Joint) -> str:
-    """Type, parent, and how certain they and the axis are."""
-    text = " or ".join([f"{joint.type} on {joint.parent}", *joint.other_parents])
-    if joint.ambiguous:
-        text += ", ambiguous"
-    deviation = direction_deviation(joint)
-    return text if deviation is None else f"{text}, axis ± {math.degrees(deviation):.2g} degree"
 
 
 def _plain(text: str) -> str:

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from splatart_ns.geometry.se3 import se3_exp
-from splatart_ns.stages.pose_notes import doubtful_rest, open_turns, turns_alike, unknown_poses
+from splatart_ns.stages.image_error import ImageError
+from splatart_ns.stages.pose_notes import doubtful_rest, ill_shown, open_turns, turns_alike, unknown_poses
 from splatart_ns.stages.render_choice import InitialMotion
 
 NAMES = ["base", "lid"]
@@ -12,6 +13,10 @@ NAMES = ["base", "lid"]
 
 def turned(degrees: float) -> torch.Tensor:
     return se3_exp(torch.tensor([0, 0, 0.1, 0, 0, math.radians(degrees)]).double())
+
+
+def error(*by_part: float) -> ImageError:
+    return ImageError(30.0, sum(by_part), torch.tensor(by_part))
 
 
 @pytest.fixture
@@ -75,3 +80,13 @@ def test_a_part_that_only_seems_to_rest_is_in_doubt_unless_more_is_found_of_it(p
     notes, doubted = doubtful_rest(maybe_moved, held, begun, poses, covariance, NAMES)
     assert [note[:18] for note in notes] == ["part lid, state 1:"] * (then == "stays")
     assert doubted.tolist() == [False, then == "stays"]
+
+
+def test_a_state_from_whose_images_the_posed_parts_are_much_further_than_its_own_splat_puts_all_in_doubt():
+    own = [error(0.002, 0.002, 0.001), error(0.0, 0.0001, 0.0)]
+    posed = [error(0.02, 0.02, 0.005), error(0.003, 0.003, 0.007)]
+    (note,), in_doubt = ill_shown(own, posed, ["shut", "open"], NAMES)
+    assert note.startswith("open: the posed parts differ from its images 13 times as much") and "at part lid" in note
+    assert in_doubt.tolist() == [True, True]
+    notes, in_doubt = ill_shown(own[:1], posed[:1], ["shut"], NAMES)
+    assert notes == [] and not in_doubt.any()

@@ -4,7 +4,7 @@ import pytest
 import viser
 from viewer_client import free_port
 
-from splatart_ns.viewer.panel import Panel, describe_joint, part_depths, tree_text
+from splatart_ns.viewer.panel import Panel, tree_text
 
 
 @pytest.fixture
@@ -35,15 +35,6 @@ def test_switched_off_parts_are_hidden(panel):
     assert panel.hidden == {"lid"}
 
 
-def test_parts_follow_what_they_hang_on(bundle):
-    assert part_depths(bundle) == [("base", 0), ("lid", 1), ("drawer", 1)]
-    bundle.joints[1].parent = "lid"
-    assert part_depths(bundle) == [("base", 0), ("lid", 1), ("drawer", 2)]
-    del bundle.joints[0]
-    bundle.joints[0].parent = "base"
-    assert part_depths(bundle) == [("base", 0), ("drawer", 1), ("lid", 0)]
-
-
 def test_the_tree_is_indented_and_fits_the_panel(bundle):
     bundle.joints[1].parent = "lid"
     assert tree_text(bundle) == "base\n└ lid\n └ drawer"
@@ -57,16 +48,6 @@ def test_a_name_cannot_become_code_of_the_page(bundle):
     )
     text = tree_text(bundle)
     assert text.count("\n") == 2 and not set("`{}<>![]()") & set(text.splitlines()[0])
-
-
-def test_a_joint_says_how_certain_its_axis_is(bundle):
-    hinge, runner = bundle.joints
-    assert describe_joint(hinge) == "revolute on base, axis ± 0.57 degree"
-    hinge.ambiguous = True
-    assert describe_joint(hinge) == "revolute on base, ambiguous, axis ± 0.57 degree"
-    hinge.alternatives.append({"type": "revolute", "residual": 0.0, "score": 0.0, "parent": "latch"})
-    assert describe_joint(hinge) == "revolute on base or latch, ambiguous, axis ± 0.57 degree"
-    assert describe_joint(runner) == "prismatic on base"
 
 
 def test_the_selected_part_is_told_with_its_joint(panel):
