@@ -1,13 +1,14 @@
-"""Turns that may leave a part looking as it did, by how its Gaussians lie about their principal axes."""
+"""Turns that may leave a part looking as it did, by how what its Gaussians cover lies about its principal axes."""
 
 from __future__ import annotations
 
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from splatart_ns.geometry.se3 import so3_exp
+from splatart_ns.geometry.se3 import matrix_from_quat, so3_exp
 from splatart_ns.splats.splat import Splat
 
 SIMILAR_MOMENTS = 0.7
@@ -47,6 +48,9 @@ def _principal_axes(splat: Splat) -> tuple[Tensor, Tensor]:
     if len(x) < 2:
         return x[:0], torch.zeros(0, dtype=torch.bool, device=x.device)
     x = x - weight @ x / weight.sum()
-    moments, axes = torch.linalg.eigh((weight[:, None] * x).mT @ x / weight.sum())
+    # The centres alone tell little of a rod that is a few pixels thick: half of its thickness is the Gaussians' own.
+    extents = matrix_from_quat(F.normalize(splat.quats.double(), dim=-1)) * splat.scales.double()[:, None]
+    spread = x[:, :, None] * x[:, None] + extents @ extents.mT
+    moments, axes = torch.linalg.eigh((weight[:, None, None] * spread).sum(0) / weight.sum())
     across = torch.stack([moments[[1, 2]], moments[[0, 2]], moments[[0, 1]]])
     return axes.mT, across[:, 0] > SIMILAR_MOMENTS * across[:, 1]

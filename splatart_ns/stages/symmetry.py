@@ -29,7 +29,7 @@ from splatart_ns.stages.part_pair import CHROMA_WEIGHT, PartPair, part_pair
 from splatart_ns.stages.refinement import normal_equations, refine
 from splatart_ns.stages.render_choice import COARSE_PIXELS, DOUBTFUL_VIEWS, VIEWS
 from splatart_ns.stages.symmetric_turns import similar_axes
-from splatart_ns.stages.unseen import unturned
+from splatart_ns.stages.unseen import least_turn, unturned
 
 MAYBE_ROUND = 0.03
 """Turning them about their principal axis raises the cost per pixel by less than this."""
@@ -127,20 +127,11 @@ def settle_turn(
         axes = torch.cat([axes, twist[None, 3:], -twist[None, 3:]])
         if not told:
             untold = untold + math.pi**2 / 3 * twist.outer(twist)
-            back = se3_exp(_least_turn(T, twist) * twist) @ T
+            back = se3_exp(least_turn(T, twist[3:]) * twist) @ T
             T = back if unturned(back) else T
         elif abs(math.remainder(angle, 2 * math.pi)) > math.radians(DIP + 0.5 * STEP):
             T = se3_exp(angle * twist) @ T
     return T, untold
-
-
-def _least_turn(T: Tensor, twist: Tensor) -> Tensor:
-    """The angle about a twist [6] of unit rotation after which a motion T [4, 4] turns least.
-
-    About the axis w it makes the trace of exp(angle [w]x) R largest: w^T R w + cos (tr R - w^T R w) + sin tr([w]x R).
-    """
-    R, w = T[:3, :3], twist[3:]
-    return torch.atan2((skew(w) @ R).trace(), R.trace() - w @ R @ w)
 
 
 def _similar_turns(pair: PartPair, T: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ from splatart_ns.stages.joint_pairs import descend_pairs, fit_pairs, stood_still
 from splatart_ns.stages.tree_reasons import exchange_hint, fits_far_worse, why_contradicted, why_unattached
 from splatart_ns.stages.tree_refinement import refine_tree
 from splatart_ns.stages.unseen import as_seen, known_states, leads_blindly, may_have_turned, place_unseen, unturned
-from splatart_ns.stages.unseen_turn import turned_unseen
+from splatart_ns.stages.unseen_turn import turned_least, turned_unseen
 
 JointMethod = Literal["screw", "descent"]
 _SEEN_NOISE = 0.3
@@ -161,7 +161,11 @@ def infer_tree(
         return replace(tree, joints=[replace(j, other=None) for j in tree.joints])
     places, motions, known = place_unseen(tree, motions, known)
     points = {p: transform_points(places[p].to(x), x) for p, x in points.items()}
-    errors, weights = _pose_errors(points, motions, covariances, known, radius, floor)
+    weighed = covariances
+    if covariances is not None:
+        tree, motions, weighed = turned_least(tree, points, motions, radius, **certainty)
+    errors = _pose_errors(points, motions, covariances, known, radius, floor)[0]
+    weights = _pose_errors(points, motions, weighed, known, radius, floor)[1]
     tree = refine_tree(tree, points, motions, errors, weights)
     return tree if covariances is None else turned_unseen(tree, points, motions, covariances, errors, constraints)
 

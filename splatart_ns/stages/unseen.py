@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from splatart_ns.geometry.se3 import inverse, so3_log
+from splatart_ns.geometry.se3 import inverse, skew, so3_log
 from splatart_ns.stages.articulate import KinematicTree
 from splatart_ns.stages.joint_fit import UNSEEN_ROTATION
 
@@ -37,6 +37,15 @@ def may_have_turned(covariances: Tensor) -> Tensor:
 def unturned(T: Tensor) -> Tensor:
     """Which motions T [..., 4, 4] hardly turn a part: bool [...]."""
     return so3_log(T[..., :3, :3]).norm(dim=-1) < math.radians(_UNTURNED)
+
+
+def least_turn(T: Tensor, axis: Tensor) -> Tensor:
+    """The angle about an axis [3] after which a motion T [4, 4] turns least.
+
+    About the axis w it makes the trace of exp(angle [w]x) R largest: w^T R w + cos (tr R - w^T R w) + sin tr([w]x R).
+    """
+    R = T[:3, :3]
+    return torch.atan2((skew(axis) @ R).trace(), R.trace() - axis @ R @ axis)
 
 
 def as_seen(covariances: Tensor) -> Tensor:

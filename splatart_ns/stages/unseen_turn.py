@@ -1,8 +1,13 @@
-"""Round parts that seem to rest: knobs and wheels, which look alike however they turn about their axis of symmetry.
+"""Round parts, which look alike however they turn about their axis of symmetry: knobs and wheels that seem to rest, and
+rods that turn about hinges.
 
 Nothing tells whether they turned, or only light by how much. A fixed joint would explain all that is seen, but nobody
 labels a knob as a part of its own for it to be fixed: it hangs on a joint about its axis, of which nothing tells the
 values, or the images do within their error.
+
+Of two states, a rod on a hinge tells the plane in which it turned, but not whether it also turned about itself: however
+far it did, some hinge explains it. The least turn against what it hangs on is about a line across the rod, as a
+tripod's legs, a lamp's arms and an aerial hang.
 """
 
 from __future__ import annotations
@@ -10,20 +15,68 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from splatart_ns.geometry.se3 import adjoint, inverse, skew, so3_log
+from splatart_ns.geometry.se3 import adjoint, inverse, se3_exp, skew, so3_log
 from splatart_ns.stages.articulate import KinematicTree
 from splatart_ns.stages.joint_constraint import JointConstraint
 from splatart_ns.stages.joint_fit import UNSEEN_ROTATION, JointFit, mean_distance
-from splatart_ns.stages.joint_pairs import stood_still
+from splatart_ns.stages.joint_pairs import fit_pairs, stood_still
+from splatart_ns.stages.unseen import as_seen, least_turn
 
 HARDLY_SEEN = math.radians(5)
 """A turn that is known no better than this, where all others are, may explain why a part seems fixed."""
 SURE = 2.0
 """So many standard deviations are a turn: the axis of a round part is given, and its value the one parameter."""
+
+
+def turned_least(
+    tree: KinematicTree,
+    points: dict[int, Tensor],
+    motions: Mapping[int, Tensor],
+    object_radius: float,
+    *,
+    covariances: Mapping[int, Tensor],
+    **settings: Any,
+) -> tuple[KinematicTree, dict[int, Tensor], dict[int, Tensor]]:
+    """The tree, motions [2, 4, 4] of its parts and covariances [2, 6, 6] by which to weigh these, where parts of whose
+    turn about one axis nothing tells turn as little as may be against their parents.
+
+    So they count as known to `HARDLY_SEEN`: less than all that is seen of other parts, but more than the noise, which
+    any turn of theirs could make up for. Other arguments as in `turned_unseen`; `settings` as in `fit_pairs`. With more
+    than two states the directions of a rod alone tell its hinge, and everything stays as it is.
+    """
+    motions, weighed = {p: T.double() for p, T in motions.items()}, dict(covariances)
+    joints, turned = [], set()
+    for joint in tree.joints:
+        a, b = joint.parent, joint.child
+        if len(motions[b]) == 2 and joint.fit.dofs > 0 and joint.fit.type != "free":
+            twist = _unseen_twist(covariances[b][1].to(motions[b]))
+            if twist is not None:
+                relative = motions[b][1] @ inverse(motions[a][1])
+                turn = se3_exp(torch.stack([0 * twist, least_turn(relative, twist[3:]) * twist]))
+                motions[b] = turn @ motions[b]
+                weighed[b] = as_seen(covariances[b]) + HARDLY_SEEN**2 * twist.outer(twist)
+                turned.add(b)
+            if turned & {a, b}:
+                pair = [{p: of_parts[p] for p in (a, b)} for of_parts in (points, motions, weighed)]
+                fit = fit_pairs(*pair[:2], object_radius, covariances=pair[2], types=[joint.fit.type], **settings)[a, b]
+                shape = {"axis": fit.axis, "origin": fit.origin, "pitch": fit.pitch, "values": fit.values}
+                joint = replace(joint, fit=replace(joint.fit, **shape))
+        joints.append(joint)
+    return replace(tree, joints=joints), motions, weighed
+
+
+def _unseen_twist(covariance: Tensor) -> Tensor | None:
+    """The twist [6] of unit rotation of the one turn that a covariance [6, 6] says is not seen; None if there is none,
+    or more than one."""
+    variances, directions = torch.linalg.eigh(covariance[3:, 3:].nan_to_num())
+    if (variances > UNSEEN_ROTATION**2).sum() != 1:
+        return None
+    return covariance[:, 3:] @ directions[:, -1] / variances[-1]
 
 
 def turned_unseen(

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -45,3 +46,15 @@ def test_a_disc_may_turn_about_its_axis_alone():
 
 def test_a_single_gaussian_has_no_turns():
     assert symmetric_turns(disc(1, TILT).select(torch.tensor([0]))).shape == (0, 3, 3)
+
+
+def test_a_rod_as_thick_as_its_gaussians_may_turn_about_its_length():
+    """Their centres lie in a plane, as those of a rod a few pixels thick may."""
+    along = torch.linspace(-0.5, 0.5, 41)
+    centres = torch.stack([0.01 * (-1.0) ** torch.arange(41), torch.zeros(41), along], -1)
+    rod = replace(disc(1, TILT).select(torch.zeros(41, dtype=torch.long)), means=centres)
+    rod = replace(rod, quats=torch.tensor([[1.0, 0, 0, 0]]), log_scales=torch.tensor([[0.02, 0.02, 0.03]]).log())
+    rod = replace(rod, quats=rod.quats.expand(41, 4), log_scales=rod.log_scales.expand(41, 3)).transformed(TILT)
+    axes = similar_axes(rod)
+    assert len(axes) == 1
+    assert float((axes[0] @ TILT[:3, 2]).abs()) > 0.999

@@ -124,3 +124,38 @@ def test_a_round_root_that_stood_still_did_not_turn_unseen(root, error):
     (joint,) = tree.joints
     assert joint.fit.type == "revolute" and not joint.fit.ambiguous
     assert float(joint.fit.values[1]) == pytest.approx(0.7, abs=1e-3 + error)
+
+
+def turned_about(axis, origin, degrees):
+    R = so3_exp(math.radians(degrees) * axis)
+    return from_rotation_translation(R, origin - R @ origin)
+
+
+@pytest.mark.parametrize("carried", [0, 50])
+@pytest.mark.parametrize("rolled", [0, 70, 150])
+def test_a_rod_on_a_hinge_turns_in_a_plane_whatever_the_turn_about_itself_that_it_was_found_with(rolled, carried):
+    """A table (1), a turret (2) that turns by `carried` about z, a rod (3) along z hung on it about y by 25 degrees."""
+    eye, foot = torch.eye(4, dtype=torch.float64), 0.3 * Z
+    points = {
+        1: box(1, (1.0, 1.0, 0.2), (0.0, 0.0, -0.2)).means.double(),
+        2: box(1, (0.4, 0.3, 0.3), (0.0, 0.0, 0.1)).means.double(),
+        3: box(1, (0.02, 0.02, 0.8), (0.0, 0.0, 0.7), spacing=0.02).means.double(),
+    }
+    turret = turned_about(Z, 0 * Z, carried)
+    hung = turret @ turned_about(Y, foot, 25)
+    rod = hung @ turned_about(Z, foot, rolled)
+    rod[:3, 3] += 1e-4 * turret[:3, :3] @ Y  # an error that a turn about itself makes up for
+    motions = {1: torch.stack([eye, eye]), 2: torch.stack([eye, turret]), 3: torch.stack([eye, rod])}
+    seen = torch.diag(torch.tensor([1e-10] * 6).double())
+    axis = hung[:3, 2]
+    twist = torch.cat([torch.linalg.cross(hung[:3, :3] @ foot + hung[:3, 3], axis), axis])
+    known = torch.stack([0 * seen, seen])
+    covariances = {1: 0 * known, 2: known, 3: known + torch.stack([0 * seen, math.pi**2 / 3 * twist.outer(twist)])}
+    constraints = [JointConstraint(parent=2, child=3, type="revolute")]
+    tree = infer_tree(points, motions, covariances=covariances, noise=1e-4, constraints=constraints)
+    joint = next(j for j in tree.joints if j.child == 3)
+    assert (joint.parent, joint.fit.type) == (2, "revolute")
+    assert abs(float(joint.fit.axis @ Y)) > math.cos(math.radians(1))
+    assert math.degrees(joint.fit.values[1]) == pytest.approx(25, abs=0.2)
+    # It is taken for granted, and is not certain for that.
+    assert math.degrees(torch.linalg.eigvalsh(torch.tensor(joint.fit.covariance["axis"]))[-1] ** 0.5) > 20
