@@ -254,6 +254,7 @@ def test_bad_options_of_render_are_refused(refused, hinge_fit, tmp_path, argumen
         (["--camera", 3], "--data is not given; give it, or leave out --camera."),
         (["--states", 3], "--dataset is not given; give it, or leave out --states."),
         (["--views", "hemisphere", "--seed", 1], "give it, or leave out --views and --seed."),
+        (["--channel", "accumulation", "--background", 0, 0, 0], "is shown on black; leave out --background."),
         (["--frames", 3], "--sweep is not given; give it, or leave out --frames."),
         (["--sweep", "--fps", 9], "new is no .gif or .mp4; give one, or leave out --fps."),
         (["--dataset", 9, "--channel", "depth"], "--dataset chooses what it shows; leave out --channel."),

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from splatart_ns.capture.capture import Capture, Frame, State
+
+IDENTITY = ("capture", "capture_sha256")
+"""Where a capture lies, and what it holds: it may be moved, or changed, and is another one if both differ."""
 
 
 def capture_digest(capture: Capture, states: Sequence[State] | None = None) -> str:
@@ -19,6 +23,16 @@ def capture_digest(capture: Capture, states: Sequence[State] | None = None) -> s
             for content in _contents(frame):
                 digest.update(content)
     return digest.hexdigest()
+
+
+def capture_identity(capture: Capture) -> dict[str, str]:
+    """What a fit's report tells of its capture: the values of `IDENTITY`."""
+    return dict(zip(IDENTITY, (str(capture.path.resolve()), capture_digest(capture)), strict=True))
+
+
+def is_another(told: Mapping[str, Any], here: Mapping[str, Any]) -> bool:
+    """Whether two reports are of different captures. One that does not tell its capture counts as of the same."""
+    return all(isinstance(had := told.get(key), str) and had != here[key] for key in IDENTITY)
 
 
 def training_digest(capture: Capture, state: int) -> bytes:

@@ -28,7 +28,7 @@ class Batch:
     """As in `splatart fit`."""
     seed: int = 0
     """As in `splatart fit`."""
-    export: tuple[Format, ...] = ()
+    export: Annotated[tuple[tuple[Format, ...], ...], tyro.conf.UseAppendAction] = ()
     """Write these formats, too."""
     rasterizer: Rasterizer = "auto"
     """As in `splatart fit`."""
@@ -41,7 +41,7 @@ class Batch:
         from splatart_ns.batch.command import fit_captures
 
         settings = {"quality": self.quality, "root": None, "seed": self.seed, "joints": []}
-        how = (self.rasterizer, self.export, self.address, self.retry_failed)
+        how = (self.rasterizer, sum(self.export, ()), self.address, self.retry_failed)
         raise SystemExit(fit_captures(self.root, self.output_dir, settings, *how, CONSOLE))
 
 

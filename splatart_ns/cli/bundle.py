@@ -66,7 +66,7 @@ class Export:
 
     bundle: Annotated[Path, tyro.conf.Positional]
     """Folder that `splatart fit` left."""
-    format: tuple[Format, ...]
+    format: Annotated[tuple[tuple[Format, ...], ...], tyro.conf.UseAppendAction]
     """One or more: urdf, mjcf (MuJoCo), usd (UsdPhysics), glb (a node a part, animated), ply (all Gaussians), html (a
     page with a slider for each joint, in one file)."""
     output: Path | None = None
@@ -85,9 +85,9 @@ class Export:
         from splatart_ns.bundle import load_bundle
 
         exports.check_numbers(self.scale, self.density, self.limit_margin)
-        formats = tuple(dict.fromkeys(self.format))
+        formats = tuple(dict.fromkeys(sum(self.format, ())))
         if not formats:
-            raise InputError(f"--format is empty; give one or more of {', '.join(get_args(Format))}.")
+            raise InputError(f"--format names none; give one or more of {', '.join(get_args(Format))}.")
         # What cannot be written is said before the meshes are made.
         exports.require(formats)
         folders = {form: self.bundle / "export" / form if self.output is None else self.output for form in formats}

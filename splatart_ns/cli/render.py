@@ -106,6 +106,7 @@ class Render:
         unused = (
             (self.dataset is not None, "--dataset chooses what it shows;", (*shown, "fps")),
             (self.dataset is None, "--dataset is not given; give it, or", ("states", "views", "seed")),
+            (self.channel == "accumulation", "--channel accumulation is shown on black;", ("background",)),
             (self.data is not None, "--data has cameras of its own;", ("resolution", "azimuth", "elevation")),
             (self.data is None, "--data is not given; give it, or", ("camera", "state")),
             (not self.sweep, "--sweep is not given; give it, or", ("frames",)),

@@ -13,6 +13,7 @@ from splatart_ns.bundle.folder import ARTICULATION, METRICS, load_bundle
 from splatart_ns.bundle.posing import observed_motions
 from splatart_ns.bundle.vantage import in_canonical_world
 from splatart_ns.capture.capture import Capture, State
+from splatart_ns.capture.digest import capture_identity, is_another
 from splatart_ns.capture.formats import load_capture, load_novel
 from splatart_ns.capture.view import load_views
 from splatart_ns.errors import InputError
@@ -46,9 +47,14 @@ def evaluate(bundle_folder: Path, capture_path: Path, device: torch.device | str
             f"{capture_path}: has other parts than {bundle_folder / ARTICULATION}; evaluate a bundle on the capture "
             "that it was fitted to"
         )
+    report = bundle_folder / "report.json"
+    told = read_record(report, "run `splatart fit` again").fields if report.is_file() else {}
+    notes = []
+    if is_another(told, capture_identity(capture)):
+        notes.append(f"{capture_path}: is not the capture that was fitted, {told['capture']}; its states may be others")
     capture = in_canonical_world(capture, bundle)
     truth = load_ground_truth(capture_path)
-    notes = ["images.lpips: its network's weights are not part of this package"]
+    notes.append("images.lpips: its network's weights are not part of this package")
     metrics: dict[str, Any] = {
         "joints": [],
         "joints_mean": {},
@@ -68,10 +74,8 @@ def evaluate(bundle_folder: Path, capture_path: Path, device: torch.device | str
     fitted = fitted_residuals(bundle, capture) if novel else {}
     for state in novel:
         metrics["held_out"][state.name] = held_out_scores(bundle, capture, state, fitted, device)
-    report = bundle_folder / "report.json"
-    if report.is_file():
-        metrics["speed"] = read_record(report, "run `splatart fit` again").fields
-    else:
+    metrics["speed"] = told
+    if not told:
         notes.append("speed: the bundle has no report.json")
     metrics["notes"] = list(dict.fromkeys(notes))
     write_json(bundle_folder / METRICS, metrics)

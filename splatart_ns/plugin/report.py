@@ -14,7 +14,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from splatart_ns.bundle.folder import ARTICULATION, remove_bundle
 from splatart_ns.capture.capture import Capture
-from splatart_ns.capture.digest import capture_digest
+from splatart_ns.capture.digest import IDENTITY, capture_identity, is_another
 from splatart_ns.errors import InputError
 from splatart_ns.files import write_json
 from splatart_ns.machine import num_cores
@@ -25,8 +25,6 @@ from splatart_ns.shape import NUMBER, has_shape, parse
 
 _REPORT = {"stages": [{"name": str, "seconds": NUMBER}], "settings": dict, "versions": dict}
 _IMAGES = [{"state": str, "psnr": NUMBER}]
-_CAPTURE = ("capture", "capture_sha256")
-"""Where it lies, and what it holds: it may be moved, or changed, and is another one if both differ."""
 TRAINED_ON = ("device", "rasterizer")
 """What the report says of the machine that trained; the one that finds the joints may be another, without a GPU."""
 
@@ -34,8 +32,7 @@ TRAINED_ON = ("device", "rasterizer")
 def report_head(capture: Capture, settings: Settings) -> dict[str, Any]:
     """What was fitted, how, and by what."""
     return {
-        "capture": str(capture.path.resolve()),
-        "capture_sha256": capture_digest(capture),
+        **capture_identity(capture),
         "settings": asdict(settings.of(capture)),
         "seed": settings.seed,
         "device": "cuda: " + torch.cuda.get_device_name() if default_device() == "cuda" else "cpu",
@@ -68,12 +65,12 @@ class Report:
             raise InputError(
                 f"{self.path} is not a report of `splatart fit`; remove it or choose another --output-dir."
             )
-        if all(isinstance(had := earlier.get(key), str) and had != self.data[key] for key in _CAPTURE):
+        if is_another(earlier, self.data):
             raise InputError(
                 f"{self.path.parent} holds a fit of {earlier['capture']}; choose another --output-dir, or remove it."
             )
         had, wanted = earlier["settings"], self.data["settings"]
-        same = all(earlier.get(key) == self.data[key] for key in _CAPTURE)
+        same = all(earlier.get(key) == self.data[key] for key in IDENTITY)
         last = ("root", "joints") if wanted["worlds"] == "shared" else ("joints",)  # the last stage alone asks
         same = same and {k: v for k, v in had.items() if k not in last} == {
             k: v for k, v in wanted.items() if k not in last

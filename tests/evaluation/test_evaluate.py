@@ -1,12 +1,15 @@
 import io
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 import torch
 from rich.console import Console
 
 from splatart_ns.bundle import save_bundle
+from splatart_ns.capture.digest import capture_identity
+from splatart_ns.capture.formats import load_capture
 from splatart_ns.errors import InputError
 from splatart_ns.evaluation import evaluate, format_tables
 
@@ -44,6 +47,17 @@ def test_a_perfect_estimate_scores_perfectly(folder, capture):
         assert scores["part_iou"] > 0.98
     assert metrics["speed"] == {"stages": {"semantic": {"seconds": 1.5}}}
     assert json.loads((folder / "metrics.json").read_text())["joints"] == metrics["joints"]
+
+
+def test_another_capture_than_the_fitted_one_is_told(folder, capture, tmp_path):
+    """Its parts and states may be called alike, and what it shows be another configuration."""
+    fitted = capture_identity(load_capture(capture))
+    moved, other = (Path(shutil.copytree(capture, tmp_path / name)) for name in ("moved", "other"))
+    shutil.copy(other / "state_01/images/0.png", other / "state_00/images/0.png")
+    (folder / "report.json").write_text(json.dumps(fitted))
+    assert not [note for data in (capture, moved) for note in evaluate(folder, data)["notes"] if "fitted" in note]
+    note = f"{other}: is not the capture that was fitted, {capture}; its states may be others"
+    assert evaluate(folder, other)["notes"][0] == note
 
 
 def test_a_long_name_is_broken_and_no_figure_cut_short(folder, capture):

@@ -34,9 +34,10 @@ def test_an_export_is_checked_and_reported(run_main, folder):
 
 def test_several_formats_get_a_folder_each(run_main, folder, tmp_path):
     options = ("--output", tmp_path / "out", "--scale", 0.1, "--no-validate")
-    code, output, _ = run_main("export", folder, "--format", "glb", "ply", "glb", *options)
+    code, output, _ = run_main("export", folder, "--format", "glb", "ply", "--format", "html", "glb", *options)
     assert code == 0 and "passed" not in output
-    assert (tmp_path / "out" / "glb" / "my_box.glb").is_file() and (tmp_path / "out" / "ply" / "my_box.ply").is_file()
+    for form in ("glb", "ply", "html"):
+        assert (tmp_path / "out" / form / f"my_box.{form}").is_file()
     assert json.loads((tmp_path / "out" / "glb" / "export.json").read_text())["metres_per_unit"] == 0.1
 
 
@@ -93,8 +94,9 @@ def test_what_cannot_be_written_is_said_before_any_mesh_is_made(run_main, folder
     (tmp_path / "out" / "glb" / "mine.txt").touch()
     code, _, errors = run_main("export", folder, "--format", "urdf", "glb", "--output", tmp_path / "out")
     assert code == 2 and "'mine.txt'" in errors
-    code, _, errors = run_main("export", folder, "--format")
-    assert code == 2 and errors.startswith("error: --format is empty; ")
+    for nothing in ((), ("--format",)):
+        code, _, errors = run_main("export", folder, *nothing)
+        assert code == 2 and errors.startswith("error: --format names none; give one or more of urdf, ")
 
 
 def test_a_part_that_cannot_be_seen_is_exported_without_a_mesh(run_main, objects, tmp_path):
