@@ -33,6 +33,7 @@ from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.flush import border_against_others
 from splatart_ns.stages.merge import merge_parts
+from splatart_ns.stages.misfit import FAR, HARDLY, misfit
 from splatart_ns.stages.motion_preference import OTHERWISE
 from splatart_ns.stages.neighbours import turned_as_neighbours_let
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
@@ -188,6 +189,7 @@ class PosePipeline(VanillaPipeline):
         self.model.worlds = torch.from_numpy(np.stack([state.placement for state in capture.states])).to(device)
         if capture.worlds != "shared":
             self._bring_together(splats, capture)
+        self._misfits = [misfit(splat, views) for splat, views in zip(splats, self.views, strict=True)]
         S, P = len(splats), self.model.num_parts
         self._reference, self._known, self._frozen = [0] * P, torch.ones(S, P, dtype=torch.bool), torch.zeros(S, P) > 0
         self._maybe_moved = torch.zeros(S, P) > 0
@@ -324,6 +326,18 @@ class PosePipeline(VanillaPipeline):
             self.notes.append(f"{part}: the images do not tell how far it turned about its own axis.")
             CONSOLE.log(self.notes[-1], markup=False)
 
+    def _note_misfits(self, T: Tensor) -> None:
+        """Say of which states' images the parts, moved by poses T [S, P, 4, 4], are far, and mark all for `doubted`."""
+        for s, (views, own) in enumerate(zip(self.views, self._misfits, strict=True)):
+            times = misfit(self.model.splat_at(s, T), views) / max(own, HARDLY)
+            if times > FAR:
+                self.model.alike[:] = True
+                self.notes.append(
+                    f"state {s}: the parts differ from its images {times:.0f} times as much as its own Gaussians do: "
+                    "their poses are wrong, or they bend, or have other ids in another state; see `splatart check`."
+                )
+                CONSOLE.log(self.notes[-1], markup=False)
+
     def _poses_from_file(self) -> Tensor:
         if self.config.init_file is None:
             raise InputError("--pipeline.init is file, but no file is given; name one by --pipeline.init-file.")
@@ -427,6 +441,7 @@ class PosePipeline(VanillaPipeline):
         def finish(step: int) -> None:
             if step == steps - 1:
                 self.model.poses.commit(self.model.poses.T())
+                self._note_misfits(self.model.poses.T())
 
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.view import View
-from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.misfit import difference
 from splatart_ns.threads import side_by_side
 
 ROUNDS = 5
@@ -45,22 +45,11 @@ def absences(splat: Splat, views: Sequence[View], seed: int) -> tuple[Tensor, fl
 def _absence(splat: Splat, view: View, seed: int) -> tuple[Tensor, Tensor]:
     splat = splat.detach()
     opacities, logits = splat.opacities, splat.opacity_logits.clone().requires_grad_()
-    rendering = render(
-        replace(splat, opacity_logits=logits),
-        view.viewmat[None],
-        view.K[None],
-        view.width,
-        view.height,
-        with_depth=False,
-    )
-    image = torch.cat([rendering.rgb[0], rendering.accumulation[0]], dim=-1)
-    target = torch.cat([view.rgb_on(torch.zeros(3).to(view.rgb.device)), view.alpha[..., None] / 255], dim=-1).to(image)
-    if view.mask is not None:
-        image, target = (x * view.mask[..., None].to(image) for x in (image, target))
-    signs = torch.randint(2, image.shape, generator=torch.Generator().manual_seed(seed)).to(image) * 2 - 1
-    gradient = torch.autograd.grad((image * signs).sum(), logits)[0]
+    off = difference(replace(splat, opacity_logits=logits), view)
+    signs = torch.randint(2, off.shape, generator=torch.Generator().manual_seed(seed)).to(off) * 2 - 1
+    gradient = torch.autograd.grad((off * signs).sum(), logits)[0]
     change = gradient / (1 - opacities).clamp_min(1e-4)  # o dI/do of do/dlogit = o (1 - o)
-    return change.square(), (image.detach() - target).square().sum()
+    return change.square(), off.detach().square().sum()
 
 
 def expendable(absence: Tensor, part_ids: Tensor, budget: float) -> Tensor:

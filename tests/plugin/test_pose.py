@@ -442,3 +442,17 @@ def test_merged_gaussians_learn_from_the_pieces_that_show_the_object(pose_traine
     first, second, third = (pipeline.get_train_loss_dict(step)[1] for step in (0, 0, 0))
     assert float(sum(second.values())) < 0.9 * float(sum(first.values()))
     assert "depth" not in first and float(third["depth"]) > 0.5 * share  # they are two or three away
+
+
+def test_parts_that_are_far_from_a_states_images_are_told_and_all_in_doubt(pose_trainer):
+    trainer = pose_trainer()
+    trainer.train()
+    pipeline, model = trainer.pipeline, trainer.pipeline.model
+    assert not any("differ" in note for note in pipeline.notes)
+    T = model.poses.T().detach().clone()
+    T[1, :, :3, 3] += 0.5
+    model.alike[:] = False
+    pipeline.notes.clear()
+    pipeline._note_misfits(T)
+    assert [note[:37] for note in pipeline.notes] == ["state 1: the parts differ from its im"]
+    assert model.alike.all()
