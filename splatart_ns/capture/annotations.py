@@ -1,4 +1,4 @@
-"""Part labels as annotation tools export them: COCO, YOLO polygons, folders of mask PNGs."""
+"""Part labels as annotation tools export them: COCO, YOLO polygons, Labelme, folders of mask PNGs."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from splatart_ns.capture.annotated_image import AnnotatedImage, Split
 from splatart_ns.capture.capture import CaptureError
 from splatart_ns.capture.class_list import by_list
 from splatart_ns.capture.coco_export import AS_COCO, read_coco
+from splatart_ns.capture.labelme_export import is_labelme, read_labelme
 from splatart_ns.capture.mask_export import MASK_CLASS_LISTS, mask_classes, masks_among, read_masks
 from splatart_ns.capture.values import is_inside, read_json, read_text, show
 from splatart_ns.capture.yolo_export import read_yolo, yolo_classes, yolo_texts
 
 _NOT_COCO = "it is no COCO file"
+_FORMATS_MEND = "export them as COCO segmentation, as YOLO polygons with data.yaml, or as mask PNGs with _classes.csv"
 
 
 @dataclass(frozen=True)
@@ -32,9 +34,10 @@ class Annotations:
 
 
 def read_annotations(path: Path) -> Annotations:
-    """Read an export: a COCO file, or a folder that holds COCO files, YOLO texts or mask PNGs, at any depth.
+    """Read an export: a COCO file, or a folder that holds COCO files, Labelme's, YOLO texts or mask PNGs, at any depth.
 
     - COCO: `.json` files with `images`, `annotations` and `categories`; polygons, runs, compressed runs.
+    - Labelme: a `.json` file with `shapes` and `imagePath` for each image; polygons.
     - YOLO: `.txt` files of "class x y x y ..." lines, coordinates from 0 to 1, beside a `data.yaml` or `classes.txt`.
     - Masks: PNGs of class ids in one channel, beside Roboflow's `_classes.csv` ("Pixel Value, Class"), or a
       `classes.txt` whose line numbers are the ids, from 0 if the first is "background", else from 1. PNGs of colours,
@@ -44,7 +47,7 @@ def read_annotations(path: Path) -> Annotations:
     An image without a shape, or whose mask holds the background alone, is not labelled; later shapes cover earlier
     ones. A class that nothing is labelled as is left out. Where train, valid and test, or states, have lists of classes
     of their own, one of these must name all classes that are used. Nothing outside the folder is opened. Hidden files,
-    and other JSON beside COCO files, are passed over.
+    and other JSON beside COCO or Labelme files, are passed over.
 
     Raises `InputError` for anything else.
     """
@@ -60,9 +63,13 @@ def _read(path: Path) -> Annotations:
             raise CaptureError(path, "it is a zip", "unpack it first and give the folder")
         if path.suffix.lower() in (".txt", ".yaml", ".yml"):
             raise CaptureError(path, "it is one file of many", "give the folder that holds data.yaml or classes.txt")
+        if path.suffix.lower() != ".json":
+            raise CaptureError(path, "there are no labels here", _FORMATS_MEND)
         if _is_json_list(path):
             raise CaptureError(path, _NOT_COCO, AS_COCO)
-        return _merged("COCO", [read_coco(path.parent, path, read_json(path))])
+        if is_labelme(content := read_json(path)):
+            return _merged("Labelme", [read_labelme(path.parent, [(path, content)])])
+        return _merged("COCO", [read_coco(path.parent, path, content)])
     if not path.is_dir():
         raise CaptureError(path, "there are no labels here", "give the file or the folder that the tool exported")
     files = sorted(
@@ -72,6 +79,8 @@ def _read(path: Path) -> Annotations:
     objects = [(f, read_json(f)) for f in jsons if not _is_json_list(f)]
     if coco := [(f, content) for f, content in objects if "annotations" in content and "images" in content]:
         return _merged("COCO", [read_coco(path, f, content) for f, content in coco])
+    if labelme := [(f, content) for f, content in objects if is_labelme(content)]:
+        return _merged("Labelme", [read_labelme(path, labelme)])
     if texts := yolo_texts(path, files):
         lists = yolo_classes(path, files)
         return _merged("YOLO", [read_yolo(path, files, named, some) for named, some in by_list(lists, texts)])
@@ -82,11 +91,7 @@ def _read(path: Path) -> Annotations:
         return _merged("masks", [read_masks(path, named, some) for named, some in masks])
     if jsons:
         raise CaptureError(jsons[0], _NOT_COCO, AS_COCO)
-    raise CaptureError(
-        path,
-        "there are no labels here",
-        "export them as COCO segmentation, as YOLO polygons with data.yaml, or as mask PNGs with _classes.csv",
-    )
+    raise CaptureError(path, "there are no labels here", _FORMATS_MEND)
 
 
 def _is_hidden(path: Path) -> bool:

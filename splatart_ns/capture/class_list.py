@@ -12,7 +12,7 @@ from splatart_ns.capture.values import read_text, show
 BACKGROUND_NAMES = ("background", "bg")
 UNLABELLED_NAMES = ("unlabelled", "unlabeled", "ignore", "void")
 """Classes of these names are no parts."""
-CLASS_LISTS = ("classes.txt", "obj.names", "_darknet.labels")
+CLASS_LISTS = ("classes.txt", "class_names.txt", "obj.names", "_darknet.labels")
 """Files with a name a line."""
 COLOUR_LIST = "labelmap.txt"
 """CVAT's file with a name and a colour a line."""
@@ -20,6 +20,16 @@ Colour = tuple[int, int, int]
 """Red, green and blue, 0..255."""
 Names = dict[int, str] | dict[Colour, str]
 """A list of classes: names by their numbers, lines, pixel values or colours."""
+
+
+def is_background(name: str) -> bool:
+    """Whether a class is what surrounds the object; Labelme calls it `_background_`."""
+    return name.lower().strip("_") in BACKGROUND_NAMES
+
+
+def is_unlabelled(name: str) -> bool:
+    """Whether a class is what nobody labelled; Labelme calls it `__ignore__`."""
+    return name.lower().strip("_") in UNLABELLED_NAMES
 
 
 def listed_classes(path: Path, files: Sequence[Path], wanted: str) -> list[tuple[Path, list[str]]]:

@@ -38,6 +38,7 @@ from splatart_ns.choices import Worlds
 
 TRANSFORMS = "transforms.json"
 SPLITS = ("train", "val", "test")
+_NERF = "transforms_train.json"
 _PARIS_STATES = ("start", "end")
 _Meta = tuple[Path, dict[str, Any]]
 
@@ -108,6 +109,10 @@ def read_capture(path: Path | str, report: Report) -> Capture:
     elif (read := peer_reader(path)) is not None:
         states, metas = read(path, report), []
     else:
+        if nerf := [*path.glob(_NERF), *sorted(path.glob(f"*/{_NERF}"))]:
+            found = "a NeRF's synthetic scene has no place for states"
+            mend = f"put the frames of each state into a {TRANSFORMS} in a folder of its own, file_path with its suffix"
+            raise CaptureError(nerf[0], found, mend)
         raise CaptureError(
             path,
             "there is no capture here",

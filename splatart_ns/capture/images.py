@@ -257,8 +257,7 @@ def downscale_labels(labels: np.ndarray, factor: int) -> np.ndarray:
 def read_bytes(path: Path, size: int = _MOST_BYTES + 1) -> bytes:
     """The first `size` bytes of a file, or all of at most 1 GiB."""
     if not os.path.isfile(path):
-        mend = "write / for \\ in its path" if "\\" in path.name else "add it or correct its path"
-        raise CaptureError(path, "the file does not exist", mend)
+        raise CaptureError(path, "the file does not exist", _missing_mend(path))
     try:
         with open(path, "rb") as file:
             data = file.read(size)
@@ -267,6 +266,14 @@ def read_bytes(path: Path, size: int = _MOST_BYTES + 1) -> bytes:
     if len(data) > _MOST_BYTES:
         raise CaptureError(path, "the file is larger than 1 GiB", "give a smaller one")
     return data
+
+
+def _missing_mend(path: Path) -> str:
+    if "\\" in path.name:
+        return "write / for \\ in its path"
+    # NeRF's synthetic scenes leave the suffix out.
+    given = next((name for suffix in (".png", ".jpg") if (name := path.with_name(path.name + suffix)).is_file()), None)
+    return f"write {given.suffix} after its path" if given is not None else "add it or correct its path"
 
 
 def _decode(path: Path, data: bytes) -> np.ndarray:

@@ -19,7 +19,7 @@ import numpy as np
 from splatart_ns.capture.annotated_image import IMAGE_SUFFIXES, AnnotatedImage
 from splatart_ns.capture.annotations import Annotations, read_annotations
 from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame, State
-from splatart_ns.capture.class_list import BACKGROUND_NAMES, UNLABELLED_NAMES
+from splatart_ns.capture.class_list import is_background, is_unlabelled
 from splatart_ns.capture.formats import SPLITS, TRANSFORMS, load_capture, load_states
 from splatart_ns.capture.images import MAX_LABEL, as_stored, orientation, write_png
 from splatart_ns.capture.part_names import safe_names
@@ -41,7 +41,7 @@ class LabelImport:
     """What an import of labels did."""
 
     format: str
-    """"COCO", "YOLO" or "masks"."""
+    """"COCO", "Labelme", "YOLO" or "masks"."""
     labelled: int
     """Frames that got labels."""
     frames: int
@@ -344,8 +344,8 @@ def _part_ids(labels: Path, parts: list[str], classes: Sequence[str]) -> np.ndar
     own = {name.lower(): part for name, part in zip(safe_names(parts), parts, strict=True)}
     ids = [0]
     for name in (name if name.lower() in known else own.get(name.lower(), name) for name in classes):
-        if name.lower() in (*BACKGROUND_NAMES, *UNLABELLED_NAMES) and name.lower() not in known:
-            ids.append(0 if name.lower() in BACKGROUND_NAMES else UNLABELLED)
+        if (is_background(name) or is_unlabelled(name)) and name.lower() not in known:
+            ids.append(0 if is_background(name) else UNLABELLED)
             continue
         if name.lower() not in known:
             parts.append(name)

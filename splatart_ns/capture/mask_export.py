@@ -21,6 +21,7 @@ from splatart_ns.capture.class_list import (
     Colour,
     Names,
     check_classes,
+    is_background,
     listed_classes,
 )
 from splatart_ns.capture.images import image_size, read_image, read_labels
@@ -31,8 +32,8 @@ MASK_CLASS_LISTS = (*CLASS_LISTS, "_classes.csv", COLOUR_LIST)
 """Files of classes beside masks."""
 _MARK = re.compile(r"[._-](mask|label|seg)s?\.png$", re.IGNORECASE)
 """How masks' names end where they lie beside the images."""
-_OTHER_FOLDERS = {"images", "image", "imgs", "img", "rgb", "JPEGImages", "SegmentationObject"}
-"""Of images, and of CVAT's masks that give every object a colour."""
+_OTHER_FOLDERS = {"images", "image", "imgs", "img", "rgb", "JPEGImages", "SegmentationObject", "SegmentationObjectPNG"}
+"""Of images, and of CVAT's and Labelme's masks that give every object a colour."""
 _BLACK = (0, 0, 0)
 _PLACES = np.array([1 << 16, 1 << 8, 1], np.uint32)
 """Of red, green and blue in a colour's code."""
@@ -52,7 +53,7 @@ def mask_classes(path: Path, files: Sequence[Path]) -> list[tuple[Path, Names]]:
     lists = [(file, _csv_classes(file)) for file in files if file.name == "_classes.csv"]
     lists = lists or [(file, _colour_classes(file, _labelmap_rows(file))) for file in files if file.name == COLOUR_LIST]
     for file, names in [] if lists else listed_classes(path, files, "_classes.csv or classes.txt"):
-        start = 0 if names and names[0].lower() in BACKGROUND_NAMES else 1
+        start = 0 if names and is_background(names[0]) else 1
         lists.append((file, {value: name for value, name in enumerate(names, start=start) if name}))
     for file, named in lists:
         check_classes(file, list(named.values()))
@@ -62,7 +63,7 @@ def mask_classes(path: Path, files: Sequence[Path]) -> list[tuple[Path, Names]]:
 def _usual(named: Names) -> Names:
     if not _coloured(named):
         return {0: BACKGROUND_NAMES[0], UNLABELLED: UNLABELLED_NAMES[0]}
-    return {} if {*BACKGROUND_NAMES} & {name.lower() for name in named.values()} else {_BLACK: BACKGROUND_NAMES[0]}
+    return {} if any(map(is_background, named.values())) else {_BLACK: BACKGROUND_NAMES[0]}
 
 
 def _coloured(named: Names) -> bool:
@@ -130,7 +131,7 @@ def _told(colour: Sequence[int]) -> str:
 def read_masks(path: Path, named: Names, pngs: Sequence[Path]) -> Split:
     """The masks of one list of classes, below `path`. Pixels are checked when they are drawn."""
     coloured, named = _coloured(named), {_code(key): name for key, name in named.items()}
-    background = {code for code, name in named.items() if name.lower() in BACKGROUND_NAMES}
+    background = {code for code, name in named.items() if is_background(name)}
     masks = [_Mask(file, coloured, tuple(named)) for file in pngs]
     with ThreadPoolExecutor(num_cores()) as pool:
         found = list(pool.map(_Mask.used, masks))

@@ -45,8 +45,8 @@ class Import:
     output_dir: Path | None = None
     """Folder of the new capture; it does not exist yet, or is empty."""
     labels: Path | None = None
-    """What the annotation tool exported: COCO segmentation, YOLO polygons with data.yaml, or mask PNGs of ids or
-    colours with _classes.csv or labelmap.txt; a file or a folder."""
+    """What the annotation tool exported: COCO segmentation, YOLO polygons with data.yaml, Labelme's JSON, or
+    mask PNGs of ids or colours with _classes.csv or labelmap.txt; a file or a folder."""
     in_place: bool = False
     """Write the labels into the capture itself."""
 

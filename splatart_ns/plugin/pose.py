@@ -471,7 +471,7 @@ class PosePipeline(VanillaPipeline):
         T = model.poses.T().detach()
         posed = [image_error(model.splat_at(s, T).detach(), views) for s, views in enumerate(self.views)]
         self.findings["images"] = [
-            {"state": name, "psnr": round(x, 2)} for name, (x, _) in zip(states, posed, strict=True)
+            {"state": name, "psnr": round(of.psnr, 2)} for name, of in zip(states, posed, strict=True)
         ]
         self._note(*ill_shown(self._shown, posed, states, model.part_names[1:]))
 

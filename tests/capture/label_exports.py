@@ -105,6 +105,35 @@ def write_masks(capture: Capture, folder: Path, name: Naming = roboflow_name) ->
     return folder
 
 
+def write_labelme(capture: Capture, folder: Path, name: Naming = flat_name) -> Path:
+    """As Labelme saves them beside images that lie elsewhere."""
+    folder.mkdir(parents=True)
+    names = {**capture.parts, 255: "__ignore__"}
+    for state, frame, labels in _labelled(capture):
+        shapes = [
+            {"label": names[part], "points": np.reshape(polygon, (-1, 2)).tolist(), "shape_type": "polygon"}
+            for part in sorted(set(np.unique(labels).tolist()) - {0})
+            for polygon in outlines(labels == part)
+        ]
+        height, width = labels.shape
+        size = {"imageData": None, "imageHeight": height, "imageWidth": width}
+        content = {"shapes": shapes, "imagePath": f"..\\photos\\{name(state, frame)}", **size}
+        (folder / f"{state.name}_{frame.image.stem}.json").write_text(json.dumps(content))
+    return folder
+
+
+def write_labelme_masks(capture: Capture, folder: Path, name: Naming = flat_name) -> Path:
+    """As Labelme's labelme2voc makes them: pictures in other colours have their parts as objects."""
+    for kind in ("SegmentationClassPNG", "SegmentationObjectPNG"):
+        (folder / kind).mkdir(parents=True)
+    (folder / "class_names.txt").write_text("\n".join(["_background_", *capture.parts.values()]))
+    for state, frame, labels in _labelled(capture):
+        file = Path(name(state, frame)).name
+        assert cv2.imwrite(str(folder / "SegmentationClassPNG" / file), labels)
+        assert cv2.imwrite(str(folder / "SegmentationObjectPNG" / file), np.where(labels == 1, 2, labels))
+    return folder
+
+
 _COLOURS = {0: (0, 0, 0), 1: (200, 60, 0), 2: (0, 0, 255), 255: (255, 255, 255)}
 
 
@@ -175,6 +204,8 @@ EXPORTS = {
     "YOLO": write_yolo,
     "YOLO of Roboflow": lambda c, out: write_yolo(c, out, roboflow_name),
     "YOLO of Label Studio": lambda c, out: write_yolo(c, out, label_studio_name),
+    "Labelme": write_labelme,
+    "masks of Labelme": write_labelme_masks,
     "masks": lambda c, out: write_masks(c, out, flat_name),
     "masks of Roboflow": write_masks,
     "colours of CVAT": lambda c, out: write_colours(c, out, "{}:{},{},{}::"),

@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from label_exports import write_coco, write_colours, write_yolo
+from label_exports import write_coco, write_colours, write_labelme, write_yolo
 
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.label_import import import_capture
@@ -32,9 +32,26 @@ def change_text(pattern, text):
     return make
 
 
+def shape(**values):
+    def make(capture, folder):
+        file = min(write_labelme(capture, folder).iterdir())
+        content = json.loads(file.read_text())
+        content["shapes"][1].update(values)
+        file.write_text(json.dumps(content))
+        return folder
+
+    return make
+
+
 def zipped(capture, folder):
     write_coco(capture, folder / "labels.json", "runs")
     return Path(shutil.make_archive(folder, "zip", folder)).replace(folder / "labels.zip")
+
+
+def cvat_xml(capture, folder):
+    folder.mkdir()
+    (folder / "annotations.xml").write_text("<annotations/>")
+    return folder / "annotations.xml"
 
 
 def one_text(capture, folder):
@@ -80,6 +97,11 @@ BAD_EXPORTS = {
     "YOLO without NaN": (change_text("train/labels/*0003.txt", "0 nan 0.1 0.2 0.1 0.2 0.2"), "nan"),
     "YAML with code": (change_text("data.yaml", "names: !!python/object/apply:os.getcwd []"), "not YAML"),
     "YAML without names": (change_text("data.yaml", "names: 3"), "names is 3"),
+    "Labelme box": (shape(shape_type="rectangle"), "state_00_0000.json: shape 1 (base) is a rectangle; draw it as"),
+    "Labelme line": (shape(points=[[1, 2], [3, 4]]), "shape 1 (base) is [1, 2, 3, 4]; give the x and y of three"),
+    "Labelme without points": (shape(points=None), "shape 1 (base) is None"),
+    "Labelme without a name": (shape(label=""), "the label of shape 1 is ''; name the part"),
+    "CVAT's own": (cvat_xml, "annotations.xml: there are no labels here; export them as COCO"),
     "one text": (one_text, "give the folder that holds data.yaml or classes.txt"),
     "zip": (zipped, "it is a zip; unpack it first"),
     "a colour without a name": (coloured("base:200,60,0::"), "0000.png: no class has the colour 0,0,255 of 32 pixels"),

@@ -111,6 +111,12 @@ def test_the_mend_of_a_windows_path_is_its_slashes(capture_folder, edit):
     assert problem.message == "the file does not exist" and problem.mend == "write / for \\ in its path"
 
 
+def test_the_mend_of_a_path_without_its_suffix_is_the_suffix(capture_folder, edit):
+    edit(capture_folder / FILE, lambda m: m["frames"][0].update(semantics_path="labels/0000"))
+    (problem,) = check_capture(capture_folder)[1]
+    assert problem.message == "the file does not exist" and problem.mend == "write .png after its path"
+
+
 def test_a_broken_state_leaves_the_other_checked(capture_folder):
     (capture_folder / FILE).write_text("{")
     (capture_folder / "state_01/images/0000.png").unlink()

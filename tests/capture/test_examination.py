@@ -131,6 +131,10 @@ DEFECTS = {
         lambda c: change_all(c / "state_01/masks", lambda mask: 255 - mask),
         {"state_01": "the silhouettes"},
     ),
+    "other ids in a state": (
+        lambda c: change_all(c / "state_01/semantics", swapped),
+        {"state_01": "what is part 1 (base) in state_00 is labelled 2 (lid) here"},
+    ),
     "a state in another world": (
         lambda c: change_poses(c / "state_01", another_world),
         {"state_01": "no part is where it was in state_00: the states may have different worlds"},

@@ -290,6 +290,16 @@ def test_a_folder_without_a_capture_is_an_input_error(tmp_path, capture_folder):
             load_capture(path)
 
 
+@pytest.mark.parametrize("folder", ["scene", "scene/shut"])
+def test_a_nerfs_synthetic_scene_is_told_what_to_make_of_it(tmp_path, folder):
+    (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / folder / "transforms_train.json").write_text('{"camera_angle_x": 0.7, "frames": []}')
+    with pytest.raises(
+        InputError, match="transforms_train.json: .*; put the frames of each state into a transforms.json"
+    ):
+        load_capture(tmp_path / "scene")
+
+
 def test_a_state_folder_alone_is_told_from_a_capture(capture_folder):
     with pytest.raises(InputError, match="no frame carries"):
         load_capture(capture_folder / "state_00")

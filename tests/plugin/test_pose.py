@@ -390,3 +390,19 @@ def test_merged_gaussians_learn_from_the_pieces_that_show_the_object(pose_traine
     first, second, third = (pipeline.get_train_loss_dict(step)[1] for step in (0, 0, 0))
     assert float(sum(second.values())) < 0.9 * float(sum(first.values()))
     assert "depth" not in first and float(third["depth"]) > 0.5 * share  # they are two or three away
+
+
+def test_parts_that_are_far_from_a_states_images_are_told_and_all_in_doubt(pose_trainer):
+    trainer = pose_trainer()
+    trainer.train()
+    pipeline, model = trainer.pipeline, trainer.pipeline.model
+    before = pipeline.findings["images"][1]
+    assert before["state"] == "state_01" and before["psnr"] > 15
+    assert not any("differ" in note for note in pipeline.notes)
+    model.poses.base[1, :, :3, 3] += 0.5
+    model.alike[:] = False
+    pipeline.notes.clear()
+    pipeline._tell_errors()
+    (note,) = pipeline.notes
+    assert note.startswith("state_01: the posed parts differ from its images ")
+    assert model.alike.all() and pipeline.findings["images"][1]["psnr"] < before["psnr"] - 3
