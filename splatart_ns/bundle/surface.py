@@ -39,6 +39,9 @@ _COARSE_PIXELS = 64
 """Size of the images that find the part's extent."""
 _AGREEING = 3
 """So many views must see through a place for it to be empty: fewer may be wrong."""
+_HARDLY, _SHARE = 4.0, 0.5
+"""And so large a share of those that see less than so many voxels past it: a flat face would sag to where the few that
+see deepest into its Gaussians have it, and there are many views of it; into a hollow few can look."""
 _SAME_SIDE = math.cos(math.radians(20))
 """A view whose direction differs by less than this from a camera's shows what the camera saw: the views are 25 degrees
 apart."""
@@ -367,22 +370,27 @@ def _upsampled(values: np.ndarray) -> np.ndarray:
 
 
 def _field(views: list[_DepthView], points: Tensor, voxel: float, extent: Extent | None) -> Tensor:
-    """Truncated signed distance [N] at `points` [N, 3], positive where empty: what _AGREEING views at least find.
+    """Truncated signed distance [N] at `points` [N, 3], positive where empty: what _AGREEING views at least find, and a
+    _SHARE of those that see hardly past a point.
 
     The mean over views, the common choice, makes two-sided sheets as thick as the truncation, or loses them. Views find
     nothing within the part's `extent` where others hid it from them in all states; None, where nothing could.
     """
     within = None if extent is None else extent.holds(points)
-    largest = torch.full((_AGREEING, len(points)), -1.0)
-    for view in views:
+    found, hardly = torch.empty(len(points), len(views)), torch.zeros(len(points))
+    for k, view in enumerate(views):
         accumulation, behind, _ = view.sample(points)
-        value = (behind / voxel - _THICKEN).div_(_BAND).clamp_(-1, 1)
-        value = torch.maximum(value, 1 - 2 * accumulation)
+        past = behind / voxel
+        value = torch.maximum(((past - _THICKEN) / _BAND).clamp(-1, 1), 1 - 2 * accumulation)
+        by_little = (accumulation > 0.5) & (past > 0) & (past < _HARDLY)
         if within is not None:
-            value[within & view.hidden(points, voxel)] = -1.0
-        for k in range(_AGREEING):
-            value, largest[k] = torch.minimum(largest[k], value), torch.maximum(largest[k], value)
-    return largest[-1]
+            hidden = within & view.hidden(points, voxel)
+            value[hidden] = -1.0
+            by_little &= ~hidden
+        found[:, k] = value
+        hardly += by_little
+    takes = (_SHARE * hardly).ceil().clamp_min(_AGREEING).long()
+    return found.sort(descending=True).values.gather(1, takes[:, None] - 1)[:, 0]
 
 
 def _without_floaters(vertices: np.ndarray, faces: np.ndarray) -> manifold3d.Manifold:

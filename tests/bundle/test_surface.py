@@ -52,7 +52,7 @@ def test_a_closed_shape_is_found_again(true):
     mesh = part_surface(splat_on(true), voxels=VOXELS)
     assert_solid(mesh)
     assert mesh.euler_number == true.euler_number
-    assert mesh.volume == pytest.approx(true.volume, rel=0.15)
+    assert mesh.volume == pytest.approx(true.volume, rel=0.05)
     assert np.sqrt((distances(mesh, true) ** 2).mean()) < 0.01
 
 
