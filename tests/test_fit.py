@@ -242,6 +242,7 @@ def test_a_fit_says_first_what_check_warns_of(hinge_capture, tmp_path, monkeypat
         labels = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
         cv2.imwrite(str(file), cv2.blur(labels, (2, 2)))
     monkeypatch.setattr(fits, "_train", lambda *_, **__: None)
+    monkeypatch.setattr(fits, "_tell", lambda *_: None)
     monkeypatch.setattr(fits, "MOST_WARNINGS", 1)
     fits.fit(capture, tmp_path / "bundle")
     told = " ".join(capsys.readouterr().out.split())
@@ -259,6 +260,7 @@ def test_a_second_fit_in_a_folder_is_refused_while_the_first_one_runs(hinge_capt
         said.append(run_main(*arguments))
 
     monkeypatch.setattr(fits, "_train", train)
+    monkeypatch.setattr(fits, "_tell", lambda *_: None)
     assert run_main(*arguments)[0] == 0
     assert len(said) == 3  # stages, each of which was the first fit's
     for code, _, errors in said:

@@ -73,10 +73,15 @@ def fit(
             _train(configs, rasterizer, report, progress, companions)
             _train({"pose": pose}, rasterizer, report, progress)
             _train({"joint": joint}, rasterizer, report, progress, whole=_is_whole(output_dir))
-    told = [*describe(load_bundle(output_dir)), report.summary]
-    told += [f"Bundle: {output_dir}", f"Config: {joint.get_base_dir() / 'config.yml'}"]
-    CONSOLE.print("\n".join(told), markup=False, highlight=False, soft_wrap=True)
+    _tell(output_dir, report, joint)
     return output_dir
+
+
+def _tell(bundle: Path, report: Report, run: TrainerConfig) -> None:
+    """Say what was found, how well, and where it is."""
+    told = [*describe(load_bundle(bundle)), report.summary]
+    told += [f"Bundle: {bundle}", f"Config: {run.get_base_dir() / 'config.yml'}"]
+    CONSOLE.print("\n".join(told), markup=False, highlight=False, soft_wrap=True)
 
 
 def _is_whole(bundle: Path) -> bool:
