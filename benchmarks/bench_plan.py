@@ -160,8 +160,7 @@ def settings_on(scene: Scene, seed: int, extent: Extent) -> list[Point]:
             point("iterations", text, *(f"effort.{n}=*{factor}" for n in ("steps", "merge_steps")), weight=factor)
         )
     for degree in extent.sh_degrees:
-        sh = (f"{stage}.pipeline.model.sh_degree={degree}" for stage in ("semantic", "pose", "joint"))
-        points.append(point("SH degree", str(degree), *sh))
+        points.append(point("SH degree", str(degree), f"semantic.pipeline.model.sh_degree={degree}"))
     steps = "pose.pipeline.model.pose_steps=200"
     rungs = {
         "registration, then descent": (steps,),

@@ -1,3 +1,4 @@
+import copy
 import json
 import math
 import time
@@ -8,10 +9,13 @@ import pytest
 from bench_plan import FULL, QUICK, SLOW_GROUPS, Scene, growths, trade_offs
 from bench_report import write_report
 from drawers_urdf import write_drawers
-from fit_with import parse
+from fit_with import apply, parse
 from sampling_profiler import SamplingProfiler
 
 from splatart_ns.capture.robot import read_urdf
+from splatart_ns.plugin import settings as efforts
+from splatart_ns.plugin import stage_configs
+from splatart_ns.plugin.model import refuse_unread
 
 MACHINE = {"commit": "abc", "cores": 2, "OMP_NUM_THREADS": None, "python": "3.11", "architecture": "x"}
 
@@ -67,6 +71,20 @@ def test_a_plan_has_every_setting_once_on_every_object(extent, tmp_path):
     }
     given = set(per_object[tmp_path.name, 0])
     assert given == {(group, label) for group, label in others if group not in ("image scale", "labelled frames")}
+
+
+@pytest.mark.parametrize("extent", [QUICK, FULL], ids=["quick", "full"])
+def test_no_setting_of_a_plan_is_refused_by_the_stage_that_it_is_for(extent, tmp_path, monkeypatch):
+    for settings in {p.settings for p in trade_offs(extent, [tmp_path])}:
+        with monkeypatch.context() as patch:
+            patch.setattr(efforts, "EFFORTS", dict(efforts.EFFORTS))
+            methods = {stage: copy.deepcopy(getattr(stage_configs, f"{stage}_method")) for stage in ("pose", "joint")}
+            patch.setattr(stage_configs, "semantic_method", copy.deepcopy(stage_configs.semantic_method))
+            for stage, method in methods.items():
+                patch.setattr(stage_configs, f"{stage}_method", method)
+            apply(settings, extent.base)
+            for stage, method in methods.items():
+                refuse_unread(method.config.pipeline.model, stage)
 
 
 def test_the_document_has_fronts_ratios_and_what_was_left_out(tmp_path):
