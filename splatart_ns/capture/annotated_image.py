@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from splatart_ns.capture.capture import CaptureError
+from splatart_ns.capture.rasters import fill_polygon
 from splatart_ns.capture.values import parse_number, show
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -28,6 +29,22 @@ class AnnotatedImage:
     draw: Callable[[int, int], np.ndarray]
     """The labels of an image of this width and height, uint16 [height, width]: 0 where nothing is drawn, else the place
     of a class in the export's classes plus 1. Raises `InputError` for a shape that makes no sense."""
+
+
+@dataclass(frozen=True)
+class Polygons:
+    """Draws polygons, later ones over earlier ones."""
+
+    shapes: Sequence[tuple[int, np.ndarray]]
+    """The value of each, and its corners [N, 2]."""
+    relative: bool = False
+    """Whether corners are in shares of the width and height, not in pixels."""
+
+    def __call__(self, width: int, height: int) -> np.ndarray:
+        labels = np.zeros((height, width), np.uint16)
+        for value, corners in self.shapes:
+            fill_polygon(labels, corners * ([width, height] if self.relative else 1), value)
+        return labels
 
 
 @dataclass(frozen=True)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from splatart_ns.capture.annotated_image import AnnotatedImage, Split, corners_of
+from splatart_ns.capture.annotated_image import AnnotatedImage, Polygons, Split, corners_of
 from splatart_ns.capture.capture import CaptureError
 from splatart_ns.capture.class_list import check_classes
-from splatart_ns.capture.rasters import fill_polygon
 from splatart_ns.capture.values import show
 
 
@@ -34,7 +32,7 @@ def read_labelme(root: Path, contents: Sequence[tuple[Path, dict[str, Any]]]) ->
             size = content.get("imageWidth"), content.get("imageHeight")
             known = size if all(type(side) is int for side in size) else None
             numbered = [(classes.index(label) + 1, corners) for label, corners in shapes]
-            images.append(AnnotatedImage(file, _image_name(root, file, content), known, _LabelmeShapes(numbered)))
+            images.append(AnnotatedImage(file, _image_name(root, file, content), known, Polygons(numbered)))
     return Split(classes, frozenset(classes), tuple(images))
 
 
@@ -59,14 +57,3 @@ def _shapes(file: Path, content: dict[str, Any]) -> Iterator[tuple[str, np.ndarr
         pairs = isinstance(points, list) and all(isinstance(point, list) and len(point) == 2 for point in points)
         corners = [x for point in points for x in point] if pairs else points
         yield label, corners_of(file, f"shape {i} ({label})", corners)
-
-
-@dataclass(frozen=True)
-class _LabelmeShapes:
-    shapes: Sequence[tuple[int, np.ndarray]]
-
-    def __call__(self, width: int, height: int) -> np.ndarray:
-        labels = np.zeros((height, width), np.uint16)
-        for value, corners in self.shapes:
-            fill_polygon(labels, corners, value)
-        return labels

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from splatart_ns.capture.annotated_image import IMAGE_SUFFIXES, AnnotatedImage, Split, corners_of
+from splatart_ns.capture.annotated_image import IMAGE_SUFFIXES, AnnotatedImage, Polygons, Split, corners_of
 from splatart_ns.capture.capture import CaptureError
 from splatart_ns.capture.class_list import CLASS_LISTS, COLOUR_LIST, Names, check_classes, listed_classes
 from splatart_ns.capture.images import image_size, orientation
-from splatart_ns.capture.rasters import fill_polygon
 from splatart_ns.capture.values import read_text, read_yaml, show
 
 _CLASS_YAMLS = ("data.yaml", "data.yml", "dataset.yaml")
@@ -78,7 +76,9 @@ def read_yolo(path: Path, files: Sequence[Path], named: Names, texts: Sequence[P
             name = file.relative_to(path).with_suffix("")
             beside = path.joinpath(*["images" if part == "labels" else part for part in name.parts])
             picture = pictures.get(beside) or pictures.get(path / name)
-            images.append(AnnotatedImage(file, name.as_posix(), picture and _shown_size(picture), _YoloShapes(shapes)))
+            images.append(
+                AnnotatedImage(file, name.as_posix(), picture and _shown_size(picture), Polygons(shapes, relative=True))
+            )
             used.update(value for value, _ in shapes)
     classes = tuple(named.values())
     return Split(classes, frozenset(classes[value - 1] for value in used), tuple(images))
@@ -106,14 +106,3 @@ def _yolo_shapes(file: Path, place: dict[int, int]) -> Iterator[tuple[int, np.nd
         if corners.min() < -0.01 or corners.max() > 1.01:
             raise CaptureError(file, f"line {i} has coordinates beyond 0 to 1", "divide them by width and height")
         yield place[number], corners
-
-
-@dataclass(frozen=True)
-class _YoloShapes:
-    shapes: Sequence[tuple[int, np.ndarray]]
-
-    def __call__(self, width: int, height: int) -> np.ndarray:
-        labels = np.zeros((height, width), np.uint16)
-        for value, corners in self.shapes:
-            fill_polygon(labels, corners * [width, height], value)
-        return labels

@@ -22,8 +22,8 @@ FEW = 4
 """Of more turns that look alike a note says how many there are, and within which bounds."""
 FAR, HARDLY = 10.0, 1e-3
 """Posed parts do not fit a state if they are so many times as far from its images as its own splat, which is hardly off
-at the second. Of 70 states of 33 objects it was 5.9 times at most; 11 to 400 where labels had other ids in one of two
-states."""
+at the second. Of 73 states of 33 sound captures it was 5.9 times at most; 11 to 400 where labels had other ids in one
+of two states."""
 
 
 def unknown_poses(known: Tensor, names: Sequence[str]) -> list[str]:
