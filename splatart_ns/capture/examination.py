@@ -25,6 +25,7 @@ from splatart_ns.capture.hull import (
     silhouette,
     visible,
 )
+from splatart_ns.capture.images import orientation
 from splatart_ns.capture.part_votes import Ballot, PartVotes, read_ballots, vote
 from splatart_ns.capture.seen_surface import LEAST_CONFIRMED, measured_surface, object_pixels
 from splatart_ns.capture.view import View, load_view
@@ -254,13 +255,14 @@ def _carve(capture: Capture, one: _Evidence) -> Iterator[Problem]:
     carving = carve([one.views[i] for i in known])
     place = capture.path / one.state.name
     if (found := contradiction(carving)) is not None:
-        yield Problem("error", place, found, POSES_MEND)
+        yield Problem("error", place, found, POSES_MEND + _as_stored(one.frames))
         return
     fitting = fitting_views(carving)
     if fitting is None or 2 * fitting.sum() < len(fitting):
         outside = float(carving.uncovered(torch.ones(len(known), dtype=torch.bool)).median())
         found = f"the silhouettes do not fit: {outside:.0%} of a frame's lies inside no point that all frames accept"
-        yield Problem("error" if outside > 0.5 else "warning", place, found, POSES_MEND)
+        severity = "error" if outside > 0.5 else "warning"
+        yield Problem(severity, place, found, POSES_MEND + _as_stored(one.frames))
         return
     odd = [known[i] for i in torch.nonzero(~fitting).flatten().tolist()]
     for frame, view in ((one.frames[i], one.views[i]) for i in odd):
@@ -268,10 +270,21 @@ def _carve(capture: Capture, one: _Evidence) -> Iterator[Problem]:
         if view.alpha is None:
             what, cause, file = "outline of the labels", "labels", frame.labels
         found = f"the {what} of {frame.name} does not fit those of the other frames"
-        yield Problem("warning", file, found, f"correct its pose or its {cause}, or take the frame out")
+        mend = f"correct its pose or its {cause}{_as_stored([frame])}, or take the frame out"
+        yield Problem("warning", file, found, mend)
     one.points, one.size = carving.surface(fitting), carving.size
     one.frames = [frame for i, frame in enumerate(one.frames) if i not in odd]
     one.views = [view for i, view in enumerate(one.views) if i not in odd]
+
+
+def _as_stored(frames: Sequence[Frame]) -> str:
+    """What masks must be, too, where EXIF data turn some of the frames' images; "" where they turn none.
+
+    Tools draw masks on what viewers show. Where that is of the size of what is stored, only the silhouettes tell.
+    """
+    turned = [frame.name for frame in frames if orientation(frame.image) > 1]
+    others = f" and {len(turned) - 1} more" if len(turned) > 1 else ""
+    return f", drawn on the pixels as they are stored (EXIF data turn {turned[0]}{others})" if turned else ""
 
 
 def _check_depth(capture: Capture, one: _Evidence) -> Iterator[Problem]:

@@ -142,11 +142,14 @@ def read_sized(path: Path, reader: Callable[[Path], np.ndarray], camera: Camera)
     array = reader(path)
     height, width = array.shape[:2]
     if (width, height) != (camera.width, camera.height):
-        raise CaptureError(
-            path,
-            f"it is {width}x{height} pixels, but its camera is {camera.width}x{camera.height}",
-            "resize the file, or correct w, h and the intrinsics",
-        )
+        found = f"it is {width}x{height} pixels, but its camera is {camera.width}x{camera.height}"
+        mend = "resize the file"
+        if (height, width) == (camera.width, camera.height):
+            mend = "turn it on its side, as the pixels of its image are stored"
+            if (turn := orientation(path)) > 1:
+                found += f", and EXIF data turn it (orientation {turn})"
+                mend = "turn its pixels so and take the orientation out, as `mogrify -auto-orient` does"
+        raise CaptureError(path, found, f"{mend}, or correct w, h and the intrinsics")
     return array
 
 

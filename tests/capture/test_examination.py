@@ -4,6 +4,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 from small_capture import looking_at_origin
 
@@ -170,6 +171,21 @@ def test_a_defect_is_told_and_its_frame_named(capture, name):
     assert all(p.mend for p in problems)
     blamed = {str(p.file.relative_to(capture)) for p in problems if p.file.suffix == ".png"}
     assert blamed <= set(expected)
+
+
+@pytest.mark.parametrize("count", [1, 6])
+def test_masks_drawn_on_images_that_exif_data_turn_are_told_so(capture, count):
+    """Of an image turned upside down its size tells nothing."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 3
+    state = capture / "state_01"
+    for k in range(count):
+        image = Image.open(state / f"images/{k:04d}.png")
+        image.save(state / f"images/{k:04d}.png", exif=exif)
+        for drawn in ("masks", "semantics"):
+            change_png(state / f"{drawn}/{k:04d}.png", lambda pixels: pixels[::-1, ::-1])
+    (problem,) = (p for p in examine(capture).problems if p.message.startswith("the silhouette"))
+    assert "drawn on the pixels as they are stored (EXIF data turn images/00" in problem.mend
 
 
 def test_wrong_axes_are_not_called_another_world(capture):

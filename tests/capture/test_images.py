@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from splatart_ns.capture.capture import Camera
 from splatart_ns.capture.images import (
@@ -223,6 +223,20 @@ def test_a_file_of_another_size_is_an_input_error(tmp_path):
     assert read_sized(path, read_mask, Camera(5, 5, 2, 1, 5, 3)).shape == (3, 5)
     with pytest.raises(InputError, match="5x3 pixels, but its camera is 3x5"):
         read_sized(path, read_mask, Camera(5, 5, 2, 1, 3, 5))
+
+
+def test_a_file_on_its_side_is_to_be_turned_not_resized(tmp_path):
+    """Phones store images on their side, with EXIF data that turn them; tools draw masks on what viewers show."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    Image.new("RGB", (5, 3)).save(tmp_path / "a.jpg", exif=exif)
+    with pytest.raises(InputError, match=r"camera is 3x5, and EXIF data turn it \(orientation 6\); turn its pixels so"):
+        read_sized(tmp_path / "a.jpg", read_image, Camera(5, 5, 1, 2, 3, 5))
+    path = write(tmp_path / "a.png", np.zeros((3, 5), np.uint8))
+    with pytest.raises(InputError, match="camera is 3x5; turn it on its side, as the pixels of its image are stored"):
+        read_sized(path, read_mask, Camera(5, 5, 1, 2, 3, 5))
+    with pytest.raises(InputError, match="camera is 4x5; resize the file"):
+        read_sized(path, read_mask, Camera(5, 5, 1, 2, 4, 5))
 
 
 def test_undistortion_gives_the_image_and_camera_of_opencvs_undistort():
