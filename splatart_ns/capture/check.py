@@ -17,16 +17,19 @@ from splatart_ns.capture.images import read_depth_for, read_image, read_labels, 
 from splatart_ns.capture.label_steps import blurred_share, count_steps
 from splatart_ns.capture.view import load_points
 from splatart_ns.capture.worlds import OTHER_WORLDS_MEND, looks_elsewhere
+from splatart_ns.choices import Worlds
 from splatart_ns.errors import InputError
 from splatart_ns.machine import num_cores
 
 
-def require_valid(path: Path | str, warn: Callable[[Problem], None] | None = None) -> Capture:
+def require_valid(
+    path: Path | str, warn: Callable[[Problem], None] | None = None, worlds: Worlds | None = None
+) -> Capture:
     """Load and check a capture. Raises `InputError` with the first error, and how many there are.
 
-    `warn` is called with each problem that is none.
+    `warn` is called with each problem that is none; `worlds` as in `check_capture`.
     """
-    capture, problems = check_capture(Path(path))
+    capture, problems = check_capture(Path(path), worlds)
     errors = [p for p in problems if p.severity == "error"]
     if errors or capture is None:
         more = f" (and {len(errors) - 1} more, see `splatart check {path}`)" if len(errors) > 1 else ""
@@ -36,11 +39,12 @@ def require_valid(path: Path | str, warn: Callable[[Problem], None] | None = Non
     return capture
 
 
-def check_capture(path: Path) -> tuple[Capture | None, list[Problem]]:
+def check_capture(path: Path, worlds: Worlds | None = None) -> tuple[Capture | None, list[Problem]]:
     """What can be read of a capture, None for nothing, and all that is wrong with it: its structure first, then its
     files frame by frame, then its views and labels.
 
-    Every file is decoded once. Never raises for what is in the capture.
+    Every file is decoded once. Never raises for what is in the capture. `worlds`: how the states' worlds are said to
+    differ, in place of what the capture says.
     """
     problems: list[Problem] = []
     try:
@@ -55,9 +59,10 @@ def check_capture(path: Path) -> tuple[Capture | None, list[Problem]]:
     by_frame = dict(zip(map(id, frames), contents, strict=True))
     problems.extend(_check_states(capture))
     problems.extend(_check_duplicates(capture))
+    said = replace(capture, worlds=worlds or capture.worlds)
     for state in capture.states:
         problems.extend(_check_cameras(capture, state))
-        if (strange := looks_elsewhere(capture, state)) is not None:
+        if (strange := looks_elsewhere(said, state)) is not None:
             problems.append(Problem("warning", capture.path / state.name, strange, OTHER_WORLDS_MEND))
         problems.extend(_check_silhouettes(capture, state, [by_frame[id(f)] for f in state.frames]))
         problems.extend(_check_steps(capture, state, [by_frame[id(f)] for f in state.frames]))

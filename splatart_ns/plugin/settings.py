@@ -62,7 +62,7 @@ def require_fittable(capture_path: Path, settings: Settings, warn: Callable[[Pro
     Raises:
         InputError: for a capture, a root, a joint or a seed that cannot be used.
     """
-    capture, root = require_valid(capture_path, warn), settings.root
+    capture, root = require_valid(capture_path, warn, settings.worlds), settings.root
     if settings.worlds is None:
         require_one_place(capture)
     if root is not None and root not in capture.parts.values():
