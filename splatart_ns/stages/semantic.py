@@ -17,6 +17,10 @@ from splatart_ns.stages.visibility import unobstructed
 WRONG_OBJECT = 0.6
 """A view's labels are wrong where it contradicts the others on so much of the object. Less would not do: of what is
 seen edge on, right labels say something else than Gaussians behind its rim."""
+WRONG_PART, LARGE_PART = 0.9, 0.1
+"""Or on so much of a part that is at least this share of the object, where two others agree: two of four links that
+change places are half of the object. (Of 38 objects with five labelled views a state none of 372 right ones is wrong by
+these, and 510 of 631 are in which two parts change places; 366 by the object alone.)"""
 
 
 def accumulation_loss(accumulation: Tensor, alpha: Tensor) -> Tensor:
@@ -92,28 +96,32 @@ def trusted(votes: Tensor, shown: Tensor) -> Tensor:
     bool [V].
 
     A glimmer of what lies behind a thin part has the part's label, and is no vote.
-    The view goes that contradicts the others most, as long as one contradicts them on much of the object. Of fewer than
-    three views nobody can tell which is wrong.
+    The view goes that contradicts the others most, as long as one contradicts them on much of the object, or on a large
+    part. Of fewer than three views nobody can tell which is wrong.
     """
     votes = votes * (shown >= TOLD)[..., None]
+    says = torch.where(votes.amax(-1) > 0, votes.argmax(-1), -1)
     kept = torch.ones(len(votes), dtype=torch.bool, device=votes.device)
     while kept.sum() >= 3:
-        total = votes[kept].sum(0)
-        share = torch.stack(
-            [_contradiction(v, total - v) if k else total.new_zeros(()) for v, k in zip(votes, kept, strict=True)]
-        )
-        if share.max() <= WRONG_OBJECT:
+        total, beyond = votes[kept].sum(0), torch.zeros(len(votes), device=votes.device)
+        for v in kept.nonzero()[:, 0].tolist():
+            part = (total - votes[v]).argmax(-1)
+            agreeing = (says[kept] == part).sum(0) - (says[v] == part).int()
+            beyond[v] = _contradiction(votes[v], part, agreeing)
+        if beyond.max() <= 1:
             break
-        kept[share.argmax()] = False
+        kept[beyond.argmax()] = False
     return kept
 
 
-def _contradiction(ballot: Tensor, others: Tensor) -> Tensor:
-    """The share of a ballot's votes [N, P + 1] on the parts' Gaussians, as the others see them, for another label."""
-    amount, part = others.max(-1)
-    counts = (amount > 0) & (part > 0)
-    cast, agreeing = ballot.sum(-1)[counts], ballot.gather(-1, part[:, None])[counts, 0]
-    return (cast - agreeing).sum() / cast.sum().clamp_min(1)
+def _contradiction(ballot: Tensor, part: Tensor, agreeing: Tensor) -> Tensor:
+    """By how many times what is bearable a ballot [N, P + 1] contradicts the others, of which so many [N] say what most
+    say of each Gaussian [N]; on the parts' Gaussians, that is, not on the background's."""
+    cast = ballot.sum(-1) * (part > 0)
+    wrong = cast - ballot.gather(-1, part[:, None])[:, 0] * (part > 0)
+    by_part = [ballot.new_zeros(ballot.shape[1]).index_add(0, part, x * (agreeing > 1)) for x in (cast, wrong)]
+    share = torch.where(by_part[0] > LARGE_PART * cast.sum(), by_part[1] / by_part[0].clamp_min(1), 0.0)
+    return torch.maximum(wrong.sum() / cast.sum().clamp_min(1) / WRONG_OBJECT, share.amax() / WRONG_PART)
 
 
 def vote_logits(votes: Tensor) -> Tensor:
