@@ -272,10 +272,11 @@ def _match(capture: Capture, labels: Path, annotations: Annotations) -> tuple[li
             found = [(s, f) for s, f in found if f.image.suffix.lower() == suffix] or found
         if len(found) > 1:
             (a, first), (b, second) = found[:2]
-            found = f"{image.name!r} may be {a.name}/{first.name} or {b.name}/{second.name}"
+            one, other = (os.path.relpath(f.image, capture.path) for f in (first, second))
+            found = f"{image.name!r} may be {one} or {other}"
             mend = f"put the labels of each state into a folder named after it, {a.name} for instance"
             if a is b:
-                mend = "give the two images names of their own, in the capture and in the export"
+                mend = f"give it its image's path, {one} for instance, or the two images names of their own"
             raise CaptureError(image.file, found, mend)
         if not found:
             unmatched.append(image.name)

@@ -278,8 +278,21 @@ def test_suffixes_tell_images_of_one_stem_apart(capture_folder, tmp_path, write)
 @pytest.mark.parametrize("write", [write_yolo, lambda c, out: write_masks(c, out, flat_name)])
 def test_images_of_one_stem_that_an_export_does_not_tell_apart_need_other_names(capture_folder, tmp_path, write):
     export = write(two_of_one_stem(capture_folder), tmp_path / "export")
-    with pytest.raises(InputError, match=r"may be state_00/images/0000.jpg or state_00/images/0000.png; give the two"):
+    with pytest.raises(InputError, match=r"may be state_00/images/0000.jpg or state_00/images/0000.png; give it"):
         import_labels(capture_folder, export)
+
+
+def test_images_of_one_name_are_told_apart_by_their_paths(single_file_folder, tmp_path):
+    """As where training and test images count from 0 each."""
+    file = single_file_folder / "transforms.json"
+    (single_file_folder / "s0/rest").mkdir()
+    (single_file_folder / "s0/images/0001.png").rename(single_file_folder / "s0/rest/0000.png")
+    file.write_text(file.read_text().replace("s0/images/0001.png", "s0/rest/0000.png"))
+    capture, truth = load_capture(single_file_folder), all_labels(single_file_folder)
+    with pytest.raises(InputError, match=r"may be s0/images/0000.png or s0/rest/0000.png; give it its image's path"):
+        import_labels(single_file_folder, write_coco(capture, tmp_path / "flat.json", "runs"))
+    import_labels(single_file_folder, write_coco(capture, tmp_path / "paths.json", "runs", lambda _, frame: frame.name))
+    assert all_labels(single_file_folder) == truth
 
 
 def test_images_without_a_frame_are_told(capture_folder, tmp_path, edit):
