@@ -107,6 +107,11 @@ def cylinder(radius: float, length: float, colour: tuple[float, float, float] | 
     return _plain(trimesh.creation.cylinder(radius=radius, height=length, sections=48), colour)
 
 
+def capsule(radius: float, length: float, colour: tuple[float, float, float] | None = None) -> Surface:
+    """A cylinder about the origin along z with a half sphere on each end; `length` is the cylinder's alone."""
+    return _plain(trimesh.creation.capsule(radius=radius, height=length, count=[48, 24]), colour)
+
+
 def sphere(radius: float, colour: tuple[float, float, float] | None = None) -> Surface:
     """A sphere about the origin."""
     return _plain(trimesh.creation.icosphere(subdivisions=3, radius=radius), colour)

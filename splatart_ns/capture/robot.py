@@ -346,9 +346,11 @@ def _visual(visual: ElementTree.Element, path: Path) -> Surface:
         return meshes.box(_sizes(shape, "size", 3, path), colour)
     if shape.tag == "cylinder":
         return meshes.cylinder(_sizes(shape, "radius", 1, path)[0], _sizes(shape, "length", 1, path)[0], colour)
+    if shape.tag == "capsule":
+        return meshes.capsule(_sizes(shape, "radius", 1, path)[0], _sizes(shape, "length", 1, path)[0], colour)
     if shape.tag == "sphere":
         return meshes.sphere(_sizes(shape, "radius", 1, path)[0], colour)
-    raise InputError(f"{path}: the shape <{shape.tag}> is not known; use mesh, box, cylinder or sphere.")
+    raise InputError(f"{path}: the shape <{shape.tag}> is not known; use mesh, box, cylinder, capsule or sphere.")
 
 
 def find_mesh(name: str, urdf: Path) -> Path:
@@ -374,9 +376,19 @@ def _origin(element: ElementTree.Element, path: Path) -> np.ndarray:
     T = np.eye(4)
     origin = element.find("origin")
     if origin is not None:
-        T[:3, :3] = Rotation.from_euler("xyz", _numbers(origin, "rpy", 3, path, "0 0 0")).as_matrix()
+        T[:3, :3] = _rotation(origin, path).as_matrix()
         T[:3, 3] = _numbers(origin, "xyz", 3, path, "0 0 0")
     return T
+
+
+def _rotation(origin: ElementTree.Element, path: Path) -> Rotation:
+    """What an <origin> is turned by: roll, pitch and yaw or, since URDF 1.2, a quaternion in their place."""
+    if origin.get("quat_xyzw") is None or origin.get("rpy") is not None:
+        return Rotation.from_euler("xyz", _numbers(origin, "rpy", 3, path, "0 0 0"))
+    quaternion = _numbers(origin, "quat_xyzw", 4, path)
+    if not quaternion.any():
+        raise InputError(f"{path}: <origin quat_xyzw={origin.get('quat_xyzw')!r}> is no rotation; mend it.")
+    return Rotation.from_quat(quaternion)
 
 
 def _attribute(element: ElementTree.Element, key: str, path: Path) -> str:

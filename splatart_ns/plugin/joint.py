@@ -32,6 +32,7 @@ from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig, refuse_
 from splatart_ns.plugin.trainer import LaterPipelineConfig, StageTrainer, StageTrainerConfig, errors_of_saving
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics, shifted
+from splatart_ns.stages.joint import leaves_unexplained
 from splatart_ns.stages.joint_constraint import parse_constraints
 from splatart_ns.stages.joint_fit import JointFit
 from splatart_ns.stages.joint_parameters import JOINT_DOFS, JOINT_LENGTHS
@@ -225,6 +226,8 @@ class JointPipeline(VanillaPipeline):
         self.notes = [f"{capture.parts[part]}: {reason}" for part, reason in self.tree.unattached.items()]
         self.notes += self.tree.contradicted.values()
         self.notes += [other_parent_note(j, capture.parts) for j in self.tree.joints if j.other is not None]
+        untold = [j for j in self.tree.joints if j.child not in self.tree.contradicted]
+        self.notes += [unexplained_note(j, capture.parts) for j in untold if leaves_unexplained(j.fit)]
         for note in self.notes:
             CONSOLE.log(note, markup=False)
         if not all(bool(states.all()) for states in known.values()):
@@ -312,6 +315,15 @@ def other_parent_note(joint: Joint, names: Mapping[int, str]) -> str:
     return (
         f"{child} hangs on {parent}, but may as well hang on {other}: --joint '{child}:{other}' says so, "
         f"--joint '{child}:{parent}' that it does not."
+    )
+
+
+def unexplained_note(joint: Joint, names: Mapping[int, str]) -> str:
+    """Of a joint that leaves more of the motions than the poses' covariances explain."""
+    child, parent = names[joint.child], names[joint.parent]
+    return (
+        f"{child}: its {joint.fit.type} joint on {parent} leaves more of the motion than the poses' errors explain; "
+        "one of the two, or what lies between them, may be posed wrongly."
     )
 
 

@@ -187,6 +187,15 @@ def _choose(
     )
 
 
+def leaves_unexplained(fit: JointFit) -> bool:
+    """Whether a joint leaves more of the motions than the noise explains, however small its residual is.
+
+    It may be two joints in a row, or one of the two parts was posed wrongly.
+    """
+    states = len(fit.values)
+    return _freedom(fit.type, states) > 0 and fit.chi2 > _explained(fit.type, states)
+
+
 def _explained(kind: str, states: int) -> float:
     """The chi^2 that is still put down to the noise; for a type that imitates others, by what it leaves over only."""
     return _EXPLAINED * (_freedom(kind, states) if kind in _RARE else 6 * (states - 1))

@@ -27,7 +27,7 @@ from splatart_ns.stages.arborescence import cheapest_parents, reached_from
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.contact import Contact, find_contacts
 from splatart_ns.stages.cylindrical import turning_slides
-from splatart_ns.stages.joint import EPSILON, NOISE, fit_joint
+from splatart_ns.stages.joint import EPSILON, NOISE, fit_joint, leaves_unexplained
 from splatart_ns.stages.joint_constraint import JointConstraint, required_parents
 from splatart_ns.stages.joint_fit import JointFit, free_joint
 from splatart_ns.stages.joint_pairs import descend_pairs, fit_pairs, stood_still, surface_error, told_pair
@@ -148,7 +148,7 @@ def infer_tree(
         contacts |= find_contacts(points, motions, {_pair(*edge) for edge in slides}, known)
     groups = _free_groups(points, motions, joints, contacts, root, radius, required)
     contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups}, known)
-    tree = build_tree(sorted(points), joints | groups, contacts, root, radius, required)
+    tree = _doubted(build_tree(sorted(points), joints | groups, contacts, root, radius, required))
     reached = reached_from([(j.parent, j.child) for j in tree.joints if (j.parent, j.child) not in groups], root)
     carried = {root, *(j.child for j in tree.joints if (j.parent, j.child) not in groups)}
     apart = {pair: contacts[pair].gap for pair in far}
@@ -290,6 +290,12 @@ def build_tree(
     loops = [j for j in rest if _closes_loop(tree, j, contacts[_pair(j.parent, j.child)], object_radius)]
     rejected = [j for j in rest if j not in loops]
     return replace(tree, loops=loops, rejected=rejected)
+
+
+def _doubted(tree: KinematicTree) -> KinematicTree:
+    """The tree with those of its joints called ambiguous that leave more than the noise explains."""
+    fits = [replace(j.fit, ambiguous=j.fit.ambiguous or leaves_unexplained(j.fit)) for j in tree.joints]
+    return replace(tree, joints=[replace(j, fit=fit) for j, fit in zip(tree.joints, fits, strict=True)])
 
 
 def _other_parents(

@@ -100,6 +100,22 @@ def test_shapes_have_their_origin_and_colour(tmp_path):
     assert np.linalg.norm(hook.corners, axis=-1) == pytest.approx(0.5)
 
 
+def test_a_capsule_has_its_caps_beyond_its_length(tmp_path):
+    text = URDF.replace('<sphere radius="0.5"/>', '<capsule radius="0.5" length="2"/>')
+    robot = read_urdf(write(tmp_path, text))
+    corners = robot.surface(robot.parts()[4], {}).corners.reshape(-1, 3)
+    assert np.abs(corners).max(axis=0) == pytest.approx([0.5, 0.5, 1.5])
+    from_axis = np.linalg.norm(corners - np.clip(corners, [0, 0, -1], [0, 0, 1]), axis=-1)
+    assert from_axis == pytest.approx(0.5)
+
+
+def test_a_quaternion_may_stand_for_roll_pitch_and_yaw(tmp_path):
+    x, y, z, w = Rotation.from_euler("xyz", [0.1, -0.4, 0.7]).as_quat()
+    text = URDF.replace('rpy="0.1 -0.4 0.7"', f'quat_xyzw="{2 * x} {2 * y} {2 * z} {2 * w}"')
+    poses, expected = (read_urdf(write(tmp_path, t)).link_poses({"swing": 0.3}) for t in (text, URDF))
+    assert poses["hook"] == pytest.approx(expected["hook"])
+
+
 def test_package_paths_are_found_above_the_urdf(tmp_path):
     folder = tmp_path / "crane_description" / "urdf"
     folder.mkdir(parents=True)
@@ -127,6 +143,7 @@ def test_package_paths_are_found_above_the_urdf(tmp_path):
         ("robot", "sdf", "<sdf>"),
         ('xyz="0 0 4"', 'xyz="0 four"', "'0 four'"),
         ('xyz="0 0 4"', 'xyz="0 0 nan"', "'0 0 nan'"),
+        ('xyz="0 0 4"', 'quat_xyzw="0 0 0 0"', "no rotation"),
         ('type="continuous"', 'type="helical"', "'helical'"),
         ('<axis xyz="0 0 2"/>', '<axis xyz="0 0 0"/>', "'swing' has the axis"),
         ('<parent link="flange"/>', "", "'hoist' lacks its <parent>"),

@@ -420,3 +420,13 @@ def test_a_thin_part_that_images_show_turning_about_its_length_turns():
     (joint,) = infer_tree(points, motions, covariances={1: 0 * seen, 2: seen}).joints
     assert joint.fit.type == "revolute"
     assert abs(float(joint.fit.values[1])) == pytest.approx(math.radians(21), abs=1e-3)
+
+
+@pytest.mark.parametrize(("sigma", "doubted"), [(1e-4, True), (1e-2, False)])
+def test_a_joint_that_leaves_more_than_the_poses_uncertainty_explains_is_in_doubt(sigma, doubted):
+    points = {1: box((0, 0, 0), (1, 1, 1), 1), 2: box((0, 0, 0.75), (0.5, 0.5, 0.5), 2)}
+    turned = se3_exp(torch.cat([0.012 * Z, 0.5 * Z]))  # that much along the axis no hinge lets it go
+    motions = {1: torch.eye(4).double().repeat(2, 1, 1), 2: torch.stack([torch.eye(4).double(), turned])}
+    covariances = {p: sigma**2 * torch.eye(6).double().repeat(2, 1, 1) for p in points}
+    (joint,) = infer_tree(points, motions, covariances=covariances, root=1).joints
+    assert joint.fit.type == "revolute" and joint.fit.ambiguous == doubted
