@@ -384,7 +384,7 @@ class PosePipeline(VanillaPipeline):
         splats = [model.state_splat(s).detach() for s in range(model.num_states)]
         as_begun = model.config.learn_gaussians == "after"
         begun = model.poses.T()
-        T, model.covariance, model.held_ratio = refine_known_poses(
+        T, model.covariance, model.held_ratio, misfits = refine_known_poses(
             splats,
             self.views,
             begun,
@@ -400,7 +400,7 @@ class PosePipeline(VanillaPipeline):
         self._note(unknown_poses(known, parts))
         self._note(open_turns(model.covariance, parts))
         self._note(*turns_alike(self._alike, self._reference, T, model.covariance, parts))
-        self._note(*doubtful_rest(self._maybe_moved, self._frozen, begun, T, model.covariance, parts))
+        self._note(*doubtful_rest(self._maybe_moved, misfits, self._frozen, begun, T, model.covariance, parts))
         merged = Splat.cat(merge_parts(splats, self.views, T, known, self._seen if as_begun else None))
         params = gauss_params_from_splat(merged)
         for name, parameter in params.items():

@@ -17,6 +17,7 @@ from splatart_ns.stages.covisibility import compared_by_common, covisible
 from splatart_ns.stages.flush import compared_by_seen, in_sight, is_flush, surface_depths, without_neighbours
 from splatart_ns.stages.free_space import FreeSpace, without_haze
 from splatart_ns.stages.joint import PRISMATIC_BELOW
+from splatart_ns.stages.motion_preference import AS_WELL
 from splatart_ns.stages.part_pair import IN_EVEN_LIGHT, PartPair, part_pair
 from splatart_ns.stages.refinement import (
     NormalEquations,
@@ -43,6 +44,10 @@ SLID = 5.0
 that turned up to 3.5, most buttons that were pressed by half a pixel to two 5 to 20."""
 LEAST_SLIDE = 0.1
 """Nor is it less than this share of a pixel: how light falls on a part otherwise moves it by 0.01."""
+MISFIT = 0.004
+"""A part does not rest where that costs more than each state's own Gaussians do by so much a pixel, as if 3 % of its
+pixels were empty, and `AS_WELL` times as much: of 99 that rest none costs so many times as much and 0.0025 more, six of
+21 that had moved 0.007 to 0.1 (docs/joints.md)."""
 MAYBE_SLIDING = math.radians(10)
 """A part that turned less than this against another may be sliding: thin parts' turns are known no better."""
 
@@ -53,7 +58,7 @@ def refine_poses(
     T: Tensor,
     frozen: Tensor,
     clear: Sequence[Tensor] | None = None,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """The last rung of the search for poses: Gauss-Newton on all views, and the certainty that they give.
 
     Few views leave the turn of a round part to chance, and the brightness of a photometric loss misleads it, because
@@ -76,11 +81,13 @@ def refine_poses(
 
     Returns:
         The refined poses, and their covariances [S, P, 6, 6]: T = se3_exp(xi) T_true, xi = (translation, rotation). NaN
-        for a part that no labelled view shows; 0 at state 0.
+        for a part that no labelled view shows; 0 at state 0. And which of those that were to stay as they are do not
+        fit there [S, P] bool.
     """
     T = T.clone()
     S, P = T.shape[:2]
     covariances = torch.zeros(S, P, 6, 6, dtype=torch.float64, device=T.device)
+    misfits = torch.zeros(S, P, dtype=torch.bool)
     something_rests = bool(frozen.all(0).any())
     comparison = _Comparison(splats, views, T, clear)
     for p in range(P):
@@ -91,6 +98,8 @@ def refine_poses(
                 covariances[s, p] = torch.nan
                 continue
             pair, found, untold = _found(comparison, pair, p + 1, s, T[s, p], bool(frozen[s, p]))
+            if frozen[s, p] and _misfits(pair, T[s, p]):
+                misfits[s, p] = _misfits(comparison.without_any_haze(pair, s, T[s, p]), T[s, p])
             T[s, p], covariances[s, p] = found.T, motion_covariance(pair, found.T, found.equations) + untold
             if something_rests and not frozen[s, p]:
                 refined += 1
@@ -100,7 +109,7 @@ def refine_poses(
         if len(slides) == refined:
             for s, (slid, covariance) in slides.items():
                 T[s, p], covariances[s, p] = slid, covariance
-    return T, covariances
+    return T, covariances, misfits
 
 
 def _found(
@@ -147,6 +156,12 @@ def _slid_a_little(pair: PartPair, stays: Refinement) -> Refinement | None:
     moved = transform_points(slide.T, pair.centroid[None])[0] - transform_points(T, pair.centroid[None])[0]
     surely = _deviations(moved, motion_covariance(pair, slide.T, slide.equations)) >= SLID
     return slide if surely and moved.norm() >= LEAST_SLIDE * _pixel(pair) else None
+
+
+def _misfits(pair: PartPair, T: Tensor) -> bool:
+    """Whether a part's images fit it far worse at T [4, 4] than each state's own Gaussians."""
+    own, cost = pair.own_cost(), float(pair.cost(T[None])[0])
+    return cost > AS_WELL * own and cost - own > MISFIT
 
 
 def _pixel(pair: PartPair) -> float:
@@ -207,7 +222,11 @@ class _Comparison:
 
     def without_haze(self, pair: PartPair, part: int, s: int, T: Tensor) -> PartPair:
         """A `pair` that has been refined to T [4, 4]; the same one where there is no haze, or the part lies flush."""
-        return pair if self._lies_flush(part, s) else without_haze(pair, T, (self._free(0), self._free(s)))
+        return pair if self._lies_flush(part, s) else self.without_any_haze(pair, s, T)
+
+    def without_any_haze(self, pair: PartPair, s: int, T: Tensor) -> PartPair:
+        """A `pair` without haze, also where the part lies flush."""
+        return without_haze(pair, T, (self._free(0), self._free(s)))
 
     def settle_turn(self, part: int, s: int, T: Tensor) -> tuple[Tensor, Tensor]:
         """See `symmetry.settle_turn`."""

@@ -83,22 +83,30 @@ def turns_alike(
 
 
 def doubtful_rest(
-    maybe_moved: Tensor, held_still: Tensor, begun: Tensor, T: Tensor, covariance: Tensor, names: Sequence[str]
+    maybe_moved: Tensor,
+    misfits: Tensor,
+    held_still: Tensor,
+    begun: Tensor,
+    T: Tensor,
+    covariance: Tensor,
+    names: Sequence[str],
 ) -> tuple[list[str], Tensor]:
     """Of which parts it is in doubt whether they rest.
 
-    Of those that the search says may have moved, `maybe_moved` [S, P], whose poses refinement, which began from
-    `begun` [S, P, 4, 4], has neither turned nor, if they were held still [S, P], moved at all, and whose covariances
-    leave no turn open.
+    Of those that the search says may have moved, `maybe_moved` [S, P], and of those that do not fit where they were to
+    stay, `misfits` [S, P], whose poses refinement, which began from `begun` [S, P, 4, 4], has neither turned nor, if
+    they were held still [S, P], moved at all, and whose covariances leave no turn open.
     """
     turned = ~unturned(inverse(begun) @ T)
     slid = held_still.to(T.device) & ~torch.isclose(T, begun).flatten(2).all(-1)
     stayed = ~(turned | slid | may_have_turned(covariance))
-    doubtful = maybe_moved & stayed.cpu()
-    notes = [
-        f"part {names[p]}, state {s}: seems to rest, but other motions fit its images a little better."
-        for s, p in doubtful.nonzero().tolist()
-    ]
+    doubtful = (maybe_moved | misfits) & stayed.cpu()
+    notes = []
+    for s, p in doubtful.nonzero().tolist():
+        but = "other motions fit its images a little better"
+        if misfits[s, p]:
+            but = "does not fit its images there, and no motion was found that does"
+        notes.append(f"part {names[p]}, state {s}: seems to rest, but {but}.")
     return notes, doubtful.any(0)
 
 

@@ -52,7 +52,7 @@ def refine_known_poses(
     reference: Sequence[int],
     known: Tensor,
     clear: Sequence[Tensor] | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """`refine_poses` and `rotation_held_ratios` of every part against its reference state.
 
     Args:
@@ -65,19 +65,21 @@ def refine_known_poses(
         clear: See `refine_poses`.
 
     Returns:
-        The refined poses, their covariances [S, P, 6, 6] (NaN where not known), and the ratios [P, P].
+        The refined poses, their covariances [S, P, 6, 6] (NaN where not known), the ratios [P, P], and which poses that
+        were to stay do not fit [S, P] bool.
     """
     S, P = T.shape[:2]
     M = since_reference(T, reference)
     covariances = torch.full((S, P, 6, 6), torch.nan, dtype=torch.float64, device=T.device)
+    misfits = torch.zeros(S, P, dtype=torch.bool)
     frozen = frozen & known  # where no motion was found nothing is known to rest
     frozen[list(reference), torch.arange(P)] = True
     for order, parts in _groups(reference, known):
         chosen = _chosen(splats, views, order, parts)
         shares = clear and [clear[s][_of(splats[s], parts)] for s in order]
-        refined, certainty = refine_poses(*chosen, M[order], frozen[order], shares)
+        refined, certainty, unfit = refine_poses(*chosen, M[order], frozen[order], shares)
         for p in parts:
-            M[order, p], covariances[order, p] = refined[:, p], certainty[:, p]
+            M[order, p], covariances[order, p], misfits[order, p] = refined[:, p], certainty[:, p], unfit[:, p]
     for p, first in enumerate(reference):
         if first == 0:
             continue
@@ -96,7 +98,7 @@ def refine_known_poses(
         found = rotation_held_ratios(*_chosen(splats, views, order, parts), since_first).to(ratios)
         against = certain[order].all(0)[:, None]
         ratios[:, parts] = torch.where(against, found[:, parts], torch.nan)
-    return T, covariances, ratios
+    return T, covariances, ratios, misfits
 
 
 def _groups(reference: Sequence[int], known: Tensor) -> Iterator[tuple[list[int], list[int]]]:

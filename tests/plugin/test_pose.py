@@ -248,7 +248,8 @@ def test_gaussians_wait_for_the_poses_or_learn_along(pose_trainer, learn):
 
 def test_merged_gaussians_that_the_images_hardly_miss_go_and_the_report_tells(pose_trainer, monkeypatch):
     def known(splats, views, T, *_):
-        return T, torch.zeros(*T.shape[:2], 6, 6, dtype=torch.float64), torch.full((2, 2), torch.nan)
+        covariance = torch.zeros(*T.shape[:2], 6, 6, dtype=torch.float64)
+        return T, covariance, torch.full((2, 2), torch.nan), torch.zeros(T.shape[:2]) > 0
 
     monkeypatch.setattr("splatart_ns.plugin.pose.refine_known_poses", known)
     trainer = pose_trainer(steps=6, pose_steps=0, init="centroids")
@@ -286,7 +287,8 @@ def test_well_known_poses_of_parts_set_free_from_others_learn_with_merged_gaussi
     def known(splats, views, T, *_):
         found["T"] = T.clone()
         variances = torch.tensor([1.0, 1, 1, turning, turning, turning], dtype=torch.float64) * (0.1 * deviation) ** 2
-        return T, variances.diag().repeat(*T.shape[:2], 1, 1), torch.full((2, 2), torch.nan)
+        covariance = variances.diag().repeat(*T.shape[:2], 1, 1)
+        return T, covariance, torch.full((2, 2), torch.nan), torch.zeros(T.shape[:2]) > 0
 
     monkeypatch.setattr("splatart_ns.plugin.pose.refine_known_poses", known)
     trainer = pose_trainer(steps=6, pose_steps=0, init="centroids")

@@ -66,7 +66,7 @@ def test_a_drawer_is_found_better_by_what_both_states_show(drawer, monkeypatch):
     frozen = torch.tensor([[True, True], [True, False]])
 
     def error():
-        T, _ = refine_poses(*drawer, POSES, frozen)
+        T, *_ = refine_poses(*drawer, POSES, frozen)
         return float((T[1, 1, :3, 3] - OPENED[:3, 3]).norm())
 
     by_common = error()

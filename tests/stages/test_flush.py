@@ -197,7 +197,7 @@ def test_a_door_that_was_shut_is_found_better(cupboard, monkeypatch):
     middle = torch.tensor([[0.235, 0.0, 0.0]], dtype=torch.float64)
 
     def errors():
-        T, _ = refine_poses(*cupboard, POSES, frozen)
+        T, *_ = refine_poses(*cupboard, POSES, frozen)
         shift = transform_points(T[1, 1], middle) - transform_points(OPENED, middle)
         return angle_deg(T[1, 1], OPENED), float(shift.norm())
 

@@ -84,12 +84,30 @@ def test_where_the_motion_is_quite_wrong_nothing_counts_as_haze(scene):
     assert without_haze(pair, far, tuple(map(FreeSpace.of, views))) is pair
 
 
+def test_what_rests_fits_though_haze_comes_to_light(scene, monkeypatch):
+    """What hides it in the first state is gone in the other."""
+    hazy = scene[0][0].select(scene[0][0].part_ids == 2)
+    cover, plate = box(1, (0.3, 0.6, 0.4), (-0.45, 0.0, 0.2)), hazy.select(torch.arange(len(hazy)) < len(hazy) - COUNT)
+    away = motion((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+    shut, opened = Splat.cat([cover, hazy]), Splat.cat([cover.transformed(away), plate])
+    views = tuple(photograph(s, 24, 96) for s in (shut, opened))
+    poses = torch.eye(4).double().repeat(2, 2, 1, 1)
+    poses[1, 0] = away
+
+    def misfits():
+        return bool(refine_poses((shut, opened), views, poses, torch.ones(2, 2) > 0)[2].any())
+
+    assert not misfits()
+    monkeypatch.setattr(pose_evidence, "without_haze", lambda pair, T, free: pair)
+    assert misfits()
+
+
 def test_haze_at_one_edge_pulls_no_part(scene, monkeypatch):
     splats, views = scene
     frozen = torch.tensor([[True, True], [True, False]])
 
     def error():
-        T, _ = refine_poses(splats, views, POSES, frozen)
+        T, *_ = refine_poses(splats, views, POSES, frozen)
         return float(se3_log(inverse(MOTION) @ T[1, 1]).norm())
 
     clear = error()

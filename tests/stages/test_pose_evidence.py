@@ -33,7 +33,7 @@ def test_poses_are_refined_but_for_frozen_ones_and_covariances_are_proper():
     truth = motion((0, 0, 20), (0.1, 0.0, 0.0))
     start = poses_of(nearby(truth, 0.03))
     frozen = torch.tensor([[True, True], [True, False]])
-    T, covariance = refine_poses(*two_states(truth), start, frozen)
+    T, covariance, _ = refine_poses(*two_states(truth), start, frozen)
     assert angle_deg(T[1, 1], truth) < 0.2 < angle_deg(start[1, 1], truth)
     assert torch.equal(T[:, 0], start[:, 0]) and torch.equal(T[0], start[0])
     assert covariance.shape == (2, 2, 6, 6)
@@ -45,7 +45,7 @@ def test_a_part_that_slides_past_one_that_rests_is_held_unturned_and_one_that_tu
     slide, tilted, turn = (motion((0, 0, degrees), (0.3, 0.1, 0.0)) for degrees in (0, 0.5, 8))
     for truth, start, rests in ((slide, tilted, True), (slide, tilted, False), (turn, turn, True)):
         frozen = torch.tensor([[True, True], [rests, False]])
-        T, covariance = refine_poses(*two_states(truth), poses_of(start), frozen)
+        T, covariance, _ = refine_poses(*two_states(truth), poses_of(start), frozen)
         held = rests and truth is slide
         assert torch.equal(T[1, 1, :3, :3], torch.eye(3).double()) == held
         assert bool((covariance[1, 1, 3:] == 0).all()) == held
@@ -56,7 +56,7 @@ def test_a_part_that_slides_past_one_that_rests_is_held_unturned_and_one_that_tu
 def test_a_part_that_seemed_to_rest_is_found_to_have_slid_by_a_quarter_of_a_pixel():
     rest = torch.ones(2, 2, dtype=torch.bool)
     slide = motion((0, 0, 0), (0.01, 0.005, 0.0))
-    T, covariance = refine_poses(*two_states(slide), poses_of(torch.eye(4).double()), rest)
+    T, covariance, _ = refine_poses(*two_states(slide), poses_of(torch.eye(4).double()), rest)
     assert (T[1, 1] - slide).abs().max() < 1e-3
     assert torch.equal(T[1, 0], torch.eye(4).double())
     assert (torch.linalg.eigvalsh(covariance[1, 1])[-3:] > 0).all()
@@ -65,8 +65,16 @@ def test_a_part_that_seemed_to_rest_is_found_to_have_slid_by_a_quarter_of_a_pixe
 @pytest.mark.parametrize("degrees", [0.0, 1.0])
 def test_a_part_that_rests_or_turned_a_little_is_not_slid(degrees):
     rest = poses_of(torch.eye(4).double())
-    T, _ = refine_poses(*two_states(motion((0, 0, degrees), (0, 0, 0))), rest, torch.ones(2, 2, dtype=torch.bool))
+    T, *_ = refine_poses(*two_states(motion((0, 0, degrees), (0, 0, 0))), rest, torch.ones(2, 2, dtype=torch.bool))
     assert torch.equal(T, rest)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 70.0])
+def test_a_part_that_was_to_stay_and_did_not_is_told(degrees):
+    rest = poses_of(torch.eye(4).double())
+    turned = two_states(motion((0, 0, degrees), (0, 0, 0)))
+    *_, misfits = refine_poses(*turned, rest, torch.ones(2, 2, dtype=torch.bool))
+    assert misfits.tolist() == [[False, False], [False, degrees > 0]]
 
 
 def test_the_last_refinement_looks_at_hues_and_at_brightness_in_even_light(monkeypatch):

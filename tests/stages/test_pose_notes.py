@@ -67,8 +67,9 @@ def test_turns_other_than_the_one_found_that_look_alike_are_told_all_if_they_are
     assert turns_alike(motions, [0, 0], poses, covariance, NAMES)[0] == []  # `open_turns` says it
 
 
+@pytest.mark.parametrize("misfits", [False, True])
 @pytest.mark.parametrize("then", ["stays", "is turned", "is slid", "may have turned"])
-def test_a_part_that_only_seems_to_rest_is_in_doubt_unless_more_is_found_of_it(poses, covariance, then):
+def test_a_part_that_only_seems_to_rest_is_in_doubt_unless_more_is_found_of_it(poses, covariance, then, misfits):
     begun, held = poses.clone(), torch.ones(2, 2, dtype=torch.bool)
     if then == "is turned":
         poses[1, 1] = turned(30)
@@ -76,9 +77,14 @@ def test_a_part_that_only_seems_to_rest_is_in_doubt_unless_more_is_found_of_it(p
         poses[1, 1, 0, 3] = 0.01
     elif then == "may have turned":
         covariance[1, 1, 5, 5] = 3.3
-    maybe_moved = torch.tensor([[False, False], [False, True]])
-    notes, doubted = doubtful_rest(maybe_moved, held, begun, poses, covariance, NAMES)
-    assert [note[:18] for note in notes] == ["part lid, state 1:"] * (then == "stays")
+    of_lid = torch.tensor([[False, False], [False, True]])
+    notes, doubted = doubtful_rest(of_lid & (not misfits), of_lid & misfits, held, begun, poses, covariance, NAMES)
+    but = (
+        "does not fit its images there, and no motion was found that does"
+        if misfits
+        else ("other motions fit its images a little better")
+    )
+    assert notes == [f"part lid, state 1: seems to rest, but {but}."] * (then == "stays")
     assert doubted.tolist() == [False, then == "stays"]
 
 

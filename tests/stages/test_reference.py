@@ -54,7 +54,7 @@ def test_a_part_that_state_0_hides_is_found_in_the_others_and_unknown_there(scen
     T[2, 1] = nearby(between, 0.03)
     frozen = torch.tensor([[True, True], [True, True], [True, False]])
     known = torch.tensor([[True, False], [True, True], [True, True]])
-    T, covariances, ratios = refine_known_poses(splats, views, T, frozen, [0, 1], known)
+    T, covariances, ratios, _ = refine_known_poses(splats, views, T, frozen, [0, 1], known)
     assert torch.equal(T[0], EYE.expand(2, 4, 4)) and torch.equal(T[1, 1], EYE)
     assert angle_deg(T[2, 1], between) < 0.2
     assert covariances.isfinite().flatten(2).all(-1).tolist() == known.tolist()
@@ -65,6 +65,12 @@ def test_a_part_that_state_0_hides_is_found_in_the_others_and_unknown_there(scen
     assert torch.cdist(merged[1].means, goal).amin(1).max() < 0.05
 
 
+def test_a_part_that_did_not_stay_where_its_reference_state_has_it_is_told(scene):
+    known = torch.tensor([[True, False], [True, True], [True, True]])
+    *_, misfits = refine_known_poses(*scene, EYE.repeat(3, 2, 1, 1), torch.ones(3, 2) > 0, [0, 1], known)
+    assert misfits.tolist() == [[False, False], [False, False], [False, True]]
+
+
 @pytest.mark.parametrize("found", [True, False])
 def test_a_slide_is_held_unturned_where_a_part_is_known_to_rest(found):
     """The base stays where it is: because it rests, or because no motion of it was found."""
@@ -73,7 +79,7 @@ def test_a_slide_is_held_unturned_where_a_part_is_known_to_rest(found):
     T = EYE.repeat(2, 2, 1, 1)
     T[1, 1] = nearby(slide, 0.01)
     frozen, known = torch.tensor([[False, False], [True, False]]), torch.tensor([[True, True], [found, True]])
-    T, _, _ = refine_known_poses(splats, [photograph(s, 8) for s in splats], T, frozen, [0, 0], known)
+    T, *_ = refine_known_poses(splats, [photograph(s, 8) for s in splats], T, frozen, [0, 0], known)
     assert torch.equal(T[1, 1, :3, :3], EYE[:3, :3]) == found
     assert angle_deg(T[1, 1], slide) < 0.5
 
@@ -84,7 +90,7 @@ def test_a_pose_at_state_0_that_is_sure_turns_motions_into_those_since_state_0(s
     views = [photograph(splats[0], 8), *views[1:]]
     truth = torch.stack([torch.stack([EYE, T]) for T in MOVES])
     frozen = torch.tensor([[True, False], [True, True], [True, False]])
-    T, covariances, _ = refine_known_poses(splats, views, truth, frozen, [0, 1], torch.ones(3, 2) > 0)
+    T, covariances, *_ = refine_known_poses(splats, views, truth, frozen, [0, 1], torch.ones(3, 2) > 0)
     assert torch.allclose(T, truth, atol=5e-3)
     assert covariances.isfinite().all() and not covariances[0].any()
     # The reference state's own pose is as uncertain as the one that it was turned by.
@@ -99,7 +105,7 @@ def test_how_clearly_gaussians_are_seen_is_measured_where_it_is_not_given(scene,
 
     def watched(splats, views, T, frozen, clear):
         told.append(clear or [clearest(s, v) for s, v in zip(splats, views, strict=True)])
-        return T, torch.zeros(*T.shape[:2], 6, 6, dtype=torch.float64)
+        return T, torch.zeros(*T.shape[:2], 6, 6, dtype=torch.float64), torch.zeros(T.shape[:2]) > 0
 
     monkeypatch.setattr(reference, "refine_poses", watched)
     given = [clearest(s, v) for s, v in zip(splats, views, strict=True)]
