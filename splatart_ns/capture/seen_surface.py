@@ -78,6 +78,23 @@ class SeenSurface:
             before += inside & far.isfinite()[row, column] & (z < near[row, column] - _IN_FRONT * size)
         return before >= _FREED_BY, torch.where(looking > 0, blank / looking, 1.0)
 
+    def passed(self, points: Tensor, widths: Tensor, size: float) -> Tensor:
+        """Which of some points [N, 3] views see past, and none sees a surface at: [N] bool.
+
+        By twice a `size`, or what a cell spans where that is more. A view of which a cell spans twice a point's width
+        [N] does not see past it: its middle pixel shows what is beside.
+        """
+        past, at = torch.zeros(2, len(points), dtype=torch.int32)
+        for view, depth in zip(self.views, self.depth, strict=True):
+            if not depth.isfinite().any():
+                continue
+            row, column, z, inside = cells(view, points, self.stride)
+            reach = (self.stride / 2 * z / view.K[0, 0]).clamp_min(size)
+            behind = torch.where(inside, depth[row, column] - z, torch.inf)
+            past += (behind > _IN_FRONT * reach) & behind.isfinite() & (widths > reach)
+            at += behind.abs() <= _IN_FRONT * reach
+        return (past >= _FREED_BY) & (at == 0)
+
     def trusted_views(self) -> list[View]:
         """The views, without what their own depth has in cells where no other view confirms it."""
         return [replace(view, depth=self._trusted(i)) for i, view in enumerate(self.views)]
@@ -165,7 +182,7 @@ def agreed(views: Sequence[View], others: Tensor, depth: Tensor, normals: Tensor
         row, column = depth[i].isfinite().nonzero().unbind(-1)
         z = depth[i, row, column]
         y, x = stride * row + stride // 2, stride * column + stride // 2
-        xyz = (_rays(view, y, x) * z[:, None] - view.viewmat[:3, 3]) @ view.viewmat[:3, :3]
+        xyz = (pixel_rays(view, y, x) * z[:, None] - view.viewmat[:3, 3]) @ view.viewmat[:3, :3]
         keep = torch.zeros(len(xyz), dtype=torch.bool)
         for other in others[i].tolist():
             r, c, d, inside = cells(views[other], xyz, stride)
@@ -179,7 +196,7 @@ def agreed(views: Sequence[View], others: Tensor, depth: Tensor, normals: Tensor
     return SeenSurface(xyz, normals, rgb, views, kept, stride, confirmed)
 
 
-def _rays(view: View, row: Tensor, column: Tensor) -> Tensor:
+def pixel_rays(view: View, row: Tensor, column: Tensor) -> Tensor:
     """Through the centres of pixels [...]: [..., 3], 1 along the optical axis."""
     return torch.stack([column + 0.5, row + 0.5, torch.ones_like(row)], -1).float() @ torch.linalg.inv(view.K).mT
 
@@ -187,7 +204,7 @@ def _rays(view: View, row: Tensor, column: Tensor) -> Tensor:
 def _normals(view: View, depth: Tensor, stride: int) -> Tensor:
     """Of cells' depth [h, w], from the neighbours on both sides: [h, w, 3] in the view's frame, 0 where unknown."""
     row, column = torch.meshgrid(*(stride * torch.arange(n) + stride // 2 for n in depth.shape), indexing="ij")
-    rays = _rays(view, row, column)
+    rays = pixel_rays(view, row, column)
     xyz = F.pad(rays * depth[..., None], (0, 0, 1, 1, 1, 1), value=torch.inf)
     normals = torch.linalg.cross(xyz[1:-1, 2:] - xyz[1:-1, :-2], xyz[2:, 1:-1] - xyz[:-2, 1:-1])
     normals = F.normalize(normals, dim=-1)

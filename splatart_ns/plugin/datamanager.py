@@ -110,6 +110,10 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         super().__init__(config, *args, test_mode=test_mode, **kwargs)
         self.slack = EXACT
         """By how much the silhouettes contradict each other."""
+        self.found = SeenSurface.nothing()
+        """Of the object's surface, by the frames' depth or stereo, where its silhouettes are known."""
+        self.voxel = 0.0
+        """Side of a voxel of the silhouettes' hull."""
         if config.seed_gaussians > 0 and test_mode == "val":  # otherwise a checkpoint brings the Gaussians
             self._add_seed_points()
 
@@ -150,7 +154,8 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
                 self._require_agreement(state)
             # A cloud of structure from motion has most of its points around the object, and few on it.
             if hull is not None:
-                points = seed_points(views, num_parts, count, generator, hull, seen_surface(views, *hull))
+                self.found, self.voxel = seen_surface(views, *hull), hull[1]
+                points = seed_points(views, num_parts, count, generator, hull, self.found)
                 self.train_dataset.metadata["points3D_inside"] = len(points.xyz)
         if points is not None:
             self.train_dataparser_outputs.metadata.update(points3D_xyz=points.xyz, points3D_rgb=points.rgb)

@@ -16,7 +16,6 @@ from torch import Tensor
 from splatart_ns.capture.capture import State
 from splatart_ns.capture.digest import training_digest
 from splatart_ns.capture.seen_surface import LEAST_CONFIRMED
-from splatart_ns.capture.view import View
 from splatart_ns.capture.worlds import OTHER_WORLDS_MEND, looks_elsewhere
 from splatart_ns.choices import RefineCameras
 from splatart_ns.errors import InputError
@@ -32,7 +31,7 @@ from splatart_ns.stages.camera_refinement import (
     refine_cameras,
 )
 from splatart_ns.stages.exposure import at_gain, frame_gains, unevenness
-from splatart_ns.stages.hull import Slack, carve, slack
+from splatart_ns.stages.hull import carve, slack
 from splatart_ns.stages.semantic import (
     accumulation_loss,
     ballots,
@@ -179,10 +178,9 @@ class SemanticModel(SplatartModel):
             self.strategy.grow_grad2d = max(self.strategy.grow_grad2d, float(need.topk(room + 1).values[-1]))
 
     @torch.no_grad()
-    def fade_outside(self, views: list[View], slack: Slack) -> None:
-        """Make Gaussians with their centre outside a silhouette, or seen by no view, transparent: they get pruned."""
-        outside = ~carve(views, self.means.cpu(), 2 + slack.pixels, slack.views).to(self.device)
-        self.gauss_params["opacities"][outside] = -10.0
+    def fade(self, which: Tensor) -> None:
+        """Make some Gaussians [N] bool transparent: they get pruned."""
+        self.gauss_params["opacities"][which.to(self.device)] = -10.0
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
         """Colour and accumulation losses in the first phase, cross-entropy of the parts in the second."""
@@ -301,12 +299,24 @@ class SemanticPipeline(VanillaPipeline):
         return callbacks
 
     def _keep_inside(self, step: int) -> None:
-        """Before every refinement: no Gaussians outside the silhouettes, where all frames have one."""
+        """Before every refinement: no Gaussians outside the silhouettes, where all frames have one, or seen by no view;
+        and, where cameras are exact, no fog."""
         config = self.model.config
         if step % config.refine_every != 0 or not 0 < step <= config.semantic_start:
             return
         if all(view.alpha is not None for view in self._views):
-            self.model.fade_outside(self._views, self._slack)
+            means = self.model.means.detach().cpu()
+            outside = ~carve(self._views, means, 2 + self._slack.pixels, self._slack.views)
+            self.model.fade(outside if self._refines else outside | self._is_fog(means))
+
+    def _is_fog(self, means: Tensor) -> Tensor:
+        """Which Gaussians [N] fill a hollow: wide ones that views see past to a surface.
+
+        Of two cupboards without texture half and more of what lies far from the surface is found so, of a table of rods
+        nothing that is right; without looking at the width 5 % of it.
+        """
+        widths = self.model.scales.detach().cpu().exp().sort(dim=-1).values[:, 1]
+        return self.datamanager.found.passed(means, widths, self.datamanager.voxel)
 
     def _refine_cameras(self, step: int) -> None:
         """Where it is time for it, move the cameras of the training frames."""

@@ -19,6 +19,7 @@ from splatart_ns.capture.seen_surface import SeenSurface, agreed, cells, grid, n
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.rasterize.rasterization import has_numba
+from splatart_ns.stages.planar_region import with_planes
 from splatart_ns.threads import num_threads
 
 PASSES = 3
@@ -62,7 +63,9 @@ def stereo_surface(views: Sequence[View], voxels: Tensor, size: float) -> SeenSu
     workers = even_bounds(len(views), min(num_threads(), len(views)))
     run(match, workers, bright, *given, stride, PASSES, depth, normals, unlike)
     depth = torch.from_numpy(np.where(unlike < UNLIKE, depth, np.inf))
-    return agreed(views, others, depth, torch.from_numpy(normals), stride)
+    normals = torch.from_numpy(normals)
+    found = agreed(views, others, depth, normals, stride)
+    return with_planes(views, others, found, normals, *bounds.unbind(1))
 
 
 def _bounds(view: View, voxels: Tensor, size: float, stride: int, shape: Sequence[int]) -> Tensor:

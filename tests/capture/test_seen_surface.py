@@ -2,9 +2,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+import torch.nn.functional as F
 from part_scene import cameras
 
-from splatart_ns.capture.seen_surface import _normals, measured_surface
+from splatart_ns.capture.seen_surface import SeenSurface, _normals, cells, measured_surface
 from splatart_ns.capture.view import View
 from splatart_ns.stages.hull import seed_points, seen_surface, visual_hull
 from splatart_ns.stages.semantic import depth_loss
@@ -112,6 +113,20 @@ def test_a_single_depth_is_not_believed_and_two_are(views, count, finds):
     found = measured_surface(few)
     assert (len(found.xyz) > 50) == finds
     assert len(found.trusted_views()) == len(views)
+
+
+def test_what_views_see_past_and_none_sees_is_passed(views, found):
+    points = torch.cat([F.normalize(found.xyz, dim=-1) * (RADIUS + up) for up in (0.25, 0.2, 0.005, -0.2)])
+    wide = torch.full((len(points),), 0.1)
+    passed = found.passed(points, wide, 0.01).view(4, -1).float().mean(-1)
+    assert passed[:2].amin() > 0.95 and passed[2:].amax() == 0
+    assert not found.passed(points, wide / 10, 0.01).any()  # cells miss what is so narrow
+    # But for what one view sees there.
+    row, column, z, inside = cells(views[3], points[:1], found.stride)
+    depth = found.depth.clone()
+    depth[3, row, column] = z
+    assert inside and not replace(found, depth=depth).passed(points[:1], wide[:1], 0.01)
+    assert not SeenSurface.nothing(views).passed(points, wide, 0.01).any()
 
 
 def test_gaussians_start_on_what_is_measured(views):

@@ -3,12 +3,14 @@ import json
 import math
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from splatart_ns.capture.seen_surface import SeenSurface
 from splatart_ns.plugin import semantic
 from splatart_ns.plugin.semantic_run import learned_views
 from splatart_ns.stages.camera_refinement import PASSES, TRIED
@@ -31,7 +33,7 @@ def test_growth_stops_at_the_limit(capture_dir, semantic_trainer):
 
 def test_gaussians_outside_the_silhouettes_fade(capture_dir, semantic_trainer):
     pipeline = semantic_trainer(capture_dir).pipeline
-    model = pipeline.model
+    model, pipeline.datamanager.found = pipeline.model, SeenSurface.nothing()
     with torch.no_grad():
         model.means[:10] = torch.tensor([0.0, 0.0, 5.0])
     before = model.opacities.detach().clone()
@@ -42,6 +44,25 @@ def test_gaussians_outside_the_silhouettes_fade(capture_dir, semantic_trainer):
     assert kept.float().mean() > 0.9
 
 
+@pytest.mark.parametrize("refines", [False, True])
+def test_gaussians_that_views_of_exact_cameras_see_past_fade(capture_dir, semantic_trainer, refines):
+    pipeline = semantic_trainer(capture_dir).pipeline
+    model = pipeline.model
+    widths = model.scales.detach().exp().median(dim=-1).values
+    passed = torch.arange(model.num_points) < 20
+
+    def stub(means, given, size):
+        assert torch.equal(given, widths) and len(means) == len(given) and size > 0
+        return passed
+
+    pipeline.datamanager.found = SimpleNamespace(passed=stub)
+    pipeline._refines, model.config.refine_every = refines, 4
+    before = model.opacities.detach().clone()
+    pipeline._keep_inside(4)
+    faded = (model.opacities < before)[:, 0]
+    assert faded[:20].all() == (not refines) and faded[20:].float().mean() < 0.1
+
+
 @pytest.mark.parametrize(
     ("slack", "shown", "stay"), [(Slack(), 255, False), (Slack(views=1), 255, True), (Slack(), 0, True)]
 )
@@ -49,6 +70,7 @@ def test_gaussians_that_a_view_loses_which_may_err_or_shows_nothing_do_not_fade(
     capture_dir, semantic_trainer, slack, shown, stay
 ):
     pipeline = semantic_trainer(capture_dir).pipeline
+    pipeline.datamanager.found = SeenSurface.nothing()
     before = pipeline.model.opacities.detach().clone()
     alpha = torch.zeros_like(pipeline._views[0].alpha)
     alpha[1, 1] = shown

@@ -1,10 +1,9 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-from part_scene import cameras
+from tray_scene import photograph, texture, textured, to_tray
 
 from splatart_ns.capture.seen_surface import agreed, neighbours
 from splatart_ns.capture.view import View
@@ -14,51 +13,10 @@ from splatart_ns.stages.stereo import stereo_surface
 
 pytest.importorskip("numba", reason="stereo is found by numba kernels")
 
-FLOOR = (-0.5, -0.4, -0.3), (0.5, 0.4, -0.25)
-WALLS = [
-    ((-0.5, -0.4, -0.3), (-0.45, 0.4, 0.2)),
-    ((0.45, -0.4, -0.3), (0.5, 0.4, 0.2)),
-    ((-0.5, -0.4, -0.3), (0.5, -0.35, 0.2)),
-    ((-0.5, 0.35, -0.3), (0.5, 0.4, 0.2)),
-]
-TRAY = [FLOOR, *WALLS]
-
-
-def photograph(contrast: float, count: int = 32, pixels: int = 128) -> list[View]:
-    """What cameras see of a tray of boxes, cast exactly; its texture has `contrast` grey levels."""
-    K = torch.tensor([[1.8 * pixels, 0, pixels / 2], [0, 1.8 * pixels, pixels / 2], [0, 0, 1]])
-    rows, columns = np.mgrid[:pixels, :pixels] + 0.5
-    rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(K.numpy().astype(float)).T
-    views = []
-    for k, viewmat in enumerate(cameras(count)):
-        R, t = viewmat[:3, :3].double().numpy(), viewmat[:3, 3].double().numpy()
-        eye, direction = -R.T @ t, rays @ R
-        depth = np.full(rows.shape, np.inf)
-        for low, high in TRAY:
-            with np.errstate(divide="ignore"):
-                ends = (np.stack([low, high])[:, None, None] - eye) / direction
-            enter, leave = ends.min(0).max(-1), ends.max(0).min(-1)
-            depth = np.where((enter < leave) & (enter < depth), enter, depth)
-        shown = np.isfinite(depth)
-        x = eye + direction * np.where(shown, depth, 0)[..., None]
-        grey = np.where(shown, np.clip(128 + contrast * texture(x), 0, 255), 0).round().astype(np.uint8)
-        alpha = torch.from_numpy(255 * shown.astype(np.uint8))
-        rgb = torch.from_numpy(grey)[..., None].repeat(1, 1, 3)
-        views.append(View(f"{k:04d}", viewmat, K, pixels, pixels, rgb, alpha, labels=(alpha > 0).to(torch.uint8)))
-    return views
-
-
-def to_tray(points: torch.Tensor) -> torch.Tensor:
-    """Distance of points [N, 3] to the surface of the tray [N], from either side of it."""
-    low, high = torch.tensor(TRAY).unbind(1)
-    outside = torch.maximum(low - points[:, None], points[:, None] - high)
-    beyond = outside.clamp_min(0).norm(dim=-1)
-    return torch.where(beyond > 0, beyond, -outside.amax(-1)).amin(-1)
-
 
 @pytest.fixture(scope="module")
 def views() -> list[View]:
-    return photograph(40)
+    return photograph(textured(40))
 
 
 @pytest.fixture(scope="module")
@@ -83,11 +41,6 @@ def test_points_lie_on_walls_and_on_the_floor_of_a_hollow(found):
     on_floor = (found.xyz[:, :2].abs() < 0.3).all(-1) & (found.xyz[:, 2] > -0.28)
     assert on_floor.sum() > 50  # the hull is 0.4 higher there
     assert (found.xyz[on_floor, 2] + 0.25).abs().median() < 0.01
-
-
-def texture(points):
-    """Grey of the tray's places [..., 3], less its mean, at contrast 1."""
-    return sum(np.sin(points @ np.array(w)) for w in ((31, 17, 23), (-19, 37, 11), (13, -23, 41))) / 3
 
 
 def test_points_have_the_colour_of_their_place(found):
@@ -146,11 +99,11 @@ def test_every_voxel_is_left_to_parts_that_have_no_other_places(hull, found):
 
 
 def test_plain_walls_are_not_found(hull):
-    assert len(stereo_surface(photograph(0), *outer(hull)).xyz) == 0
+    assert len(stereo_surface(photograph(textured(0)), *outer(hull)).xyz) == 0
 
 
 def test_faint_textures_are_found(hull, found):
-    faint = stereo_surface(photograph(4), *outer(hull))
+    faint = stereo_surface(photograph(textured(4)), *outer(hull))
     assert len(faint.xyz) > 0.5 * len(found.xyz)
     assert to_tray(faint.xyz).median() < 0.01
 
@@ -186,7 +139,7 @@ def test_images_of_several_sizes_are_matched(views, hull):
 
 @pytest.mark.parametrize("pixels", [1, 2, 4])
 def test_images_of_a_few_pixels_do_no_harm(hull, pixels):
-    found = stereo_surface(photograph(40, pixels=pixels), *outer(hull))
+    found = stereo_surface(photograph(textured(40), pixels=pixels), *outer(hull))
     assert found.xyz.isfinite().all() and not found.judged(*hull)[0].all()
 
 
