@@ -119,7 +119,7 @@ def test_what_views_see_past_and_none_sees_is_passed(views, found):
     points = torch.cat([F.normalize(found.xyz, dim=-1) * (RADIUS + up) for up in (0.25, 0.2, 0.005, -0.2)])
     wide = torch.full((len(points),), 0.1)
     passed = found.passed(points, wide, 0.01).view(4, -1).float().mean(-1)
-    assert passed[:2].amin() > 0.95 and passed[2:].amax() == 0
+    assert passed[:2].amin() > 0.85 and passed[2:].amax() == 0
     assert not found.passed(points, wide / 10, 0.01).any()  # cells miss what is so narrow
     # But for what one view sees there.
     row, column, z, inside = cells(views[3], points[:1], found.stride)
