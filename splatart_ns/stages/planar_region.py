@@ -39,7 +39,7 @@ _COVERED = 0.3
 _DIRECTIONS, _LEAST_WEIGHT, _SAME_DIRECTION = 6, 0.03, 0.995
 """Most directions, the least share of all cells that one has, and the least cosine within one."""
 _OFFSETS, _LEAST_ON_PARALLEL = 2, 4
-"""_Planes of each direction that are tried, and how much of the border lies on them."""
+"""Planes of each direction that are tried, and how much of the border lies on them."""
 _LIKE = 30
 """Places look alike whose brightness (0..765) differs by less. (20 and 40 tell right places of a fridge, a table and a
 cupboard from wrong ones as well; with 80 half of the wrong ones pass.)"""
@@ -57,7 +57,7 @@ _UNLIKE, _PLACE_UNLIKE = 0.2, 0.35
 
 
 _Planes = Iterator[tuple[np.ndarray, np.ndarray]]
-"""_Planes, p [3] of the points with p x = 1 in the view's frame, and which of a region's cells each may hold [N]."""
+"""Planes, p [3] of the points with p x = 1 in the view's frame, and which of a region's cells each may hold [N]."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def _regions(index: int, view: View, numbers: np.ndarray, found: SeenSurface) ->
 def _pieces(
     region: _Region, view: View, directions: np.ndarray | None, near: np.ndarray, far: np.ndarray
 ) -> Iterator[_Piece]:
-    """_Planes over a region of a view: through its border, or of given `directions` [D, 3] in the world."""
+    """Planes over a region of a view: through its border, or of given `directions` [D, 3] in the world."""
     column, row = region.cells.T
     planes = _through(region, view) if directions is None else _parallel(region, directions @ _rotation(view).T)
     for plane, inside in planes:
@@ -182,7 +182,7 @@ def _pieces(
 
 
 def _through(region: _Region, view: View) -> _Planes:
-    """_Planes through much of the border, and the cells between what lies on them."""
+    """Planes through much of the border, and the cells between what lies on them."""
     random = np.random.default_rng(region.view)
     rays, inverse, border = region.border_rays, 1 / region.border_depth, region.border
     least = max(_LEAST_ON, _LEAST_SHARE * len(border))
@@ -207,7 +207,7 @@ def _through(region: _Region, view: View) -> _Planes:
 
 
 def _parallel(region: _Region, directions: np.ndarray) -> _Planes:
-    """_Planes of given normals [D, 3] in the view's frame through some of the border, over all cells."""
+    """Planes of given normals [D, 3] in the view's frame through some of the border, over all cells."""
     near = 1.5 * _NEAR * region.border_depth.mean()
     for normal in directions:
         offset = region.border_depth * (region.border_rays @ normal)
