@@ -44,10 +44,10 @@ SLID = 5.0
 that turned up to 3.5, most buttons that were pressed by half a pixel to two 5 to 20."""
 LEAST_SLIDE = 0.1
 """Nor is it less than this share of a pixel: how light falls on a part otherwise moves it by 0.01."""
-MISFIT = 0.004
-"""A part does not rest where that costs more than each state's own Gaussians do by so much a pixel, as if 3 % of its
-pixels were empty, and `AS_WELL` times as much: of 99 that rest none costs so many times as much and 0.0025 more, six of
-21 that had moved 0.007 to 0.1 (docs/joints.md)."""
+MISFIT = 0.006
+"""A part does not rest where that costs more than each state's own Gaussians do by so much a pixel, as if 4 % of its
+pixels were empty, and `AS_WELL` times as much: of 99 that rest none costs so many times as much and 0.0025 more, a part
+in images of 64 pixels 0.0056, six of 21 that had moved 0.0067 to 0.1 (docs/joints.md)."""
 MAYBE_SLIDING = math.radians(10)
 """A part that turned less than this against another may be sliding: thin parts' turns are known no better."""
 
