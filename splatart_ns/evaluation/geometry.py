@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from splatart_ns.bundle.bundle import Bundle
 from splatart_ns.bundle.occlusion import surroundings
 from splatart_ns.bundle.surface import part_surface
+from splatart_ns.bundle.vantage import cameras_around
 from splatart_ns.errors import InputError
 from splatart_ns.evaluation.ground_truth import GroundTruth
 from splatart_ns.geometry.se3 import transform_points
@@ -61,7 +62,7 @@ def chamfer_mesh(ground_truth: GroundTruth, bundle: Bundle) -> dict[str, Any]:
     for part in bundle.parts:
         # A part without visible Gaussians has no surface.
         with contextlib.suppress(InputError):
-            meshes[part.id] = part_surface(part.splat, around=surroundings(bundle, part))
+            meshes[part.id] = part_surface(part.splat, cameras_around(bundle, part), surroundings(bundle, part))
     sampled = {part: trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)[0] for part, mesh in meshes.items()}
     if not meshes:
         return _chamfers(ground_truth, bundle, {}, *_sampled_whole({}))

@@ -213,6 +213,16 @@ def test_the_face_that_another_part_lies_on_in_all_states_is_closed():
     assert under.bounds[1, 2] == pytest.approx(0.2, abs=0.03)
 
 
+def test_the_underside_at_which_no_camera_looked_is_closed():
+    """The open side of a box is its underside, or it is not."""
+    above = torch.tensor([[0, 0, 9.0], [5, 0, 3], [-5, 0, 3], [0, 5, 3], [0, -5, 3]], dtype=torch.float64)
+    from_above, from_below = (part_surface(open_box(), cameras, voxels=VOXELS) for cameras in (above, -above))
+    assert_solid(from_below)
+    assert from_above.volume < 0.5 * 1 * 0.6 * 0.4
+    assert from_below.volume == pytest.approx(1 * 0.6 * 0.4, rel=0.15)
+    assert from_below.bounds[1, 2] == pytest.approx(0.2, abs=0.03)
+
+
 def test_a_hollow_stays_that_another_part_uncovers_in_some_state():
     alone = part_surface(open_box(), voxels=VOXELS)
     uncovered = part_surface(open_box(), around=[lying_on(0.2), lying_on(3.0)], voxels=VOXELS)
