@@ -45,10 +45,10 @@ see deepest into its Gaussians have it, and there are many views of it; into a h
 _SAME_SIDE = math.cos(math.radians(20))
 """A view whose direction differs by less than this from a camera's shows what the camera saw: the views are 25 degrees
 apart."""
-_BLIND = math.cos(math.radians(45))
-"""What a view from a direction that differs by more than this from all cameras' sees past was not looked into. (With
-40 and 50 degrees ten parts of furniture and of scissors come as near the truth, with 25 a skirted cabinet 1.4 times as
-far.)"""
+_BLIND = math.cos(math.radians(35))
+"""Into what views from directions that differ by more than this from all cameras' see no camera looked. (With 25 to 45
+degrees meshes of eight pieces of furniture come equally near the truth in the mean: the smaller, the fuller is a box
+on the ground, and the further off a cupboard on a skirting.)"""
 _HIDDEN = 2.0
 """What lies so much further than what stands before it is hidden by that, voxels."""
 _FRONT_PIXELS = 128
