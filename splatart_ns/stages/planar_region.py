@@ -2,8 +2,7 @@
 
 Piecewise planar stereo: planes come from a region's border, and from the directions that other regions' planes have
 (Furukawa et al., "Manhattan-world stereo", 2009). Which of them it is, if any, is told by all views: there the region
-would look the same, before nothing that is found, and in front of everything else. Before walls that are black all over
-any plane does, so one with no more than a direction from elsewhere must also look wrong where it were nearer.
+would look the same, before nothing that is found, and in front of everything else.
 """
 
 from __future__ import annotations
@@ -55,10 +54,6 @@ _PASSED = 2
 """... in so many views."""
 _UNLIKE, _PLACE_UNLIKE = 0.2, 0.35
 """Share of the views to which a region may look otherwise, in the mean over its places, and each place."""
-_NEARER, _WORSE = 0.2, 0.5
-"""A plane of another's direction must look wrong to so much larger a share where it were so much nearer to the view, in
-the normalised world. (Of what is found of a black safe 79 % instead of 48 % lies on it then, of eight pieces of
-furniture as much as before.)"""
 
 
 _Planes = Iterator[tuple[np.ndarray, np.ndarray]]
@@ -128,8 +123,7 @@ def with_planes(
             if (i, region.number) not in done
             for piece in _pieces(region, view, directions, near[i].numpy(), far[i].numpy())
         ]
-        right = _right(tried, views, shown, found)
-        best = _best(_nearest(right, near, views, shown, found) if parallel else right)
+        best = _best(tried, views, shown, found)
         for piece in best:
             depth[piece.view, piece.row, piece.column] = piece.depth
             normals[piece.view, piece.row, piece.column] = piece.normal
@@ -250,62 +244,18 @@ def _directions(pieces: Sequence[_Piece], views: Sequence[View]) -> np.ndarray:
     return np.array(found).reshape(-1, 3)
 
 
-@dataclass(frozen=True)
-class _Judged:
-    """A piece, and what all views say of it."""
-
-    piece: _Piece
-    unlike: Tensor
-    """In which share of the views that would see its places they look otherwise [N]."""
-    passed: Tensor
-    """Which of its places views see past [N] bool."""
-
-    @property
-    def wrong(self) -> float:
-        """From 0, where all views agree, to 2."""
-        return float(self.unlike.mean() + self.passed.float().mean())
-
-
-def _judged(
-    pieces: Sequence[_Piece], views: Sequence[View], shown: Sequence[Tensor], found: SeenSurface
-) -> list[_Judged]:
+def _best(pieces: Sequence[_Piece], views: Sequence[View], shown: Sequence[Tensor], found: SeenSurface) -> list[_Piece]:
+    """Of each region the piece that looks most alike in all views, if it does; less the cells that do not."""
     if not pieces:
         return []
+    best: dict[tuple[int, int], tuple[float, _Piece]] = {}
     counts = [len(piece.row) for piece in pieces]
     seen = (of_all.split(counts) for of_all in _seen(pieces, views, shown, found))
-    return [_Judged(*each) for each in zip(pieces, *seen, strict=True)]
-
-
-def _right(
-    pieces: Sequence[_Piece], views: Sequence[View], shown: Sequence[Tensor], found: SeenSurface
-) -> list[_Judged]:
-    """The pieces that look alike in all views."""
-    return [judged for judged in _judged(pieces, views, shown, found) if judged.wrong < _UNLIKE]
-
-
-def _nearest(
-    right: Sequence[_Judged], near: Tensor, views: Sequence[View], shown: Sequence[Tensor], found: SeenSurface
-) -> list[_Judged]:
-    """Of pieces that look alike those that would not if they were nearer: before the silhouettes, or in views."""
-    pieces = [replace(judged.piece, depth=judged.piece.depth - _NEARER) for judged in right]
-    kept = []
-    for judged, nearer in zip(right, _judged(pieces, views, shown, found), strict=True):
-        piece = nearer.piece
-        outside = piece.depth < near[piece.view, piece.row, piece.column]
-        wrong = torch.where(outside, 1.0, nearer.unlike + nearer.passed.float()).mean()
-        if wrong >= judged.wrong + _WORSE:
-            kept.append(judged)
-    return kept
-
-
-def _best(right: Sequence[_Judged]) -> list[_Piece]:
-    """Of each region the piece that looks most alike in all views; less the cells that do not."""
-    best: dict[tuple[int, int], _Judged] = {}
-    for judged in right:
-        key = judged.piece.view, judged.piece.number
-        if key not in best or judged.wrong < best[key].wrong:
-            best[key] = judged
-    return [each.piece.part((each.unlike <= _PLACE_UNLIKE) & ~each.passed) for each in best.values()]
+    for piece, unlike, passed in zip(pieces, *seen, strict=True):
+        wrong = float(unlike.mean() + passed.float().mean())
+        if wrong < best.get((piece.view, piece.number), (_UNLIKE,))[0]:
+            best[piece.view, piece.number] = wrong, piece.part((unlike <= _PLACE_UNLIKE) & ~passed)
+    return [piece for _, piece in best.values()]
 
 
 def _seen(

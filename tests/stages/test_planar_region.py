@@ -3,7 +3,6 @@ import pytest
 import torch
 from tray_scene import photograph, to_tray
 
-from splatart_ns.capture.seen_surface import object_pixels
 from splatart_ns.stages import planar_region, stereo
 from splatart_ns.stages.hull import surface, visual_hull
 from splatart_ns.stages.stereo import stereo_surface
@@ -76,19 +75,3 @@ def test_a_hollow_is_passed_and_surfaces_are_not(hull, found, by_stereo):
     shares = [surface.passed(hollow, wide, hull[1]).float().mean() for surface in (found, by_stereo)]
     assert shares[0] > 0.93 > shares[1]
     assert not found.passed(found.xyz[to_tray(found.xyz) < 0.01], wide, hull[1]).any()
-
-
-def test_of_planes_that_look_right_only_the_nearest_is_taken():
-    """Of a thing of one colour all over any place within the silhouettes looks right."""
-    views = photograph(lambda x, _: 60 + 0 * x[..., 0])
-    voxels, size = visual_hull(views)
-    found = stereo_surface(views, voxels[surface(voxels, size)], size)
-    near, far = stereo._bounds(views[0], voxels[surface(voxels, size)], size, found.stride, found.depth.shape[1:])
-    row, column = (near + 0.4 < far).nonzero().unbind(-1)
-    first = near[row, column]
-    pieces = [planar_region._Piece(0, 1, torch.tensor([0.0, 0, -1]), row, column, first + d) for d in (0.1, 0.3)]
-    given = views, [object_pixels(view) for view in views], found
-    right = planar_region._right(pieces, *given)
-    assert len(found.xyz) == 0 and len(right) == 2
-    kept = planar_region._nearest(right, near[None], *given)
-    assert [judged.piece is pieces[0] for judged in kept] == [True]
