@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatart_ns.evaluation import geometry
 from splatart_ns.evaluation.geometry import chamfer, chamfer_centres, chamfer_mesh, farthest_points
 
 
@@ -74,6 +75,14 @@ def test_the_mesh_is_scored_at_both_ends(truth, bundle):
     assert wrong["parts"] == pytest.approx(values["parts"], rel=0.05)
     assert wrong["last"]["parts"]["latch"] > values["last"]["parts"]["latch"] + 1
     assert wrong["last"]["CD-s"] == pytest.approx(values["last"]["CD-s"], rel=0.05)
+
+
+def test_the_mesh_is_closed_where_no_camera_looked_as_in_exports(truth, bundle, monkeypatch):
+    seen_by, made = [], geometry.part_surface
+    monkeypatch.setattr(geometry, "part_surface", lambda *given: seen_by.append(given[1]) or made(*given))
+    bundle.provenance["cameras"] = [[[0.0, 0.0, 9.0]], [[0.0, 9.0, 0.0]]]
+    chamfer_mesh(truth, bundle)
+    assert [len(cameras) for cameras in seen_by] == [2] * len(bundle.parts)
 
 
 def test_a_part_that_nobody_sees_has_no_mesh(truth, bundle):
