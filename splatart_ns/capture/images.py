@@ -61,7 +61,7 @@ def read_labels(path: Path) -> np.ndarray:
     elif kind == "RGB" and (labels == labels[..., :1]).all():
         labels = np.ascontiguousarray(labels[..., 0])
     elif kind != "grey" or bits < 8:
-        raise CaptureError(path, f"labels are a {bits}-bit {kind} PNG", _LABELS_MEND)
+        raise CaptureError(path, f"labels are a PNG of {bits}-bit {kind}", _LABELS_MEND)
     if labels.dtype == np.uint16:
         if labels.max(initial=0) > UNLABELLED:
             raise CaptureError(

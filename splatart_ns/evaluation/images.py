@@ -134,11 +134,14 @@ def mapped_value(joint: Joint, truth: TrueJoint, change: float) -> Tensor:
 
 
 def is_mapped(bundle: Bundle, ground_truth: GroundTruth) -> bool:
-    """Whether every true joint has an estimated one of the same pair of parts and the same type."""
+    """Whether every true joint has an estimated one of the same pair of parts and the same type.
+
+    Of joints that carry nothing with a shape, or the root alone (a base without one), none is asked for.
+    """
     names = {part.id: part.name for part in bundle.parts}
     for truth in ground_truth.joints:
-        if None in (truth.parent, truth.child):
-            return False
+        if truth.child in (None, ground_truth.root):
+            continue
         pair = names.get(truth.parent), names.get(truth.child)
         joint = find_joint(bundle, *pair) if None not in pair else None
         if joint is None or not joint.in_tree or JOINT_DOFS[joint.type] != 1 or joint.type != truth.type:

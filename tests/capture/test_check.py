@@ -54,7 +54,7 @@ def test_every_frame_is_looked_at_and_every_problem_told(capture_folder):
         "0002.png: it is 16x8 pixels, but its camera is 16x16",
         "0002.png: it is 8x8 pixels, but its camera is 16x16",
         "0003.png: the label 9 is none of the declared parts 1 to 2",
-        "0007.png: labels are a 8-bit RGB PNG",
+        "0007.png: labels are a PNG of 8-bit RGB",
     ]
 
 

@@ -121,3 +121,13 @@ def test_joints_of_another_kind_are_not_mapped_exactly(truth, bundle):
     assert is_mapped(bundle, truth)
     bundle.joints[1].parent = "body"
     assert not is_mapped(bundle, truth)
+
+
+def test_a_base_without_a_shape_and_what_carries_nothing_are_no_joints_of_another_kind(truth, bundle):
+    hinge = truth.joints[0]
+    base = replace(hinge, name="base", type="fixed", parent=None, parent_name="world", child=truth.root)
+    mark = replace(hinge, name="mark", type="fixed", parent=hinge.child, child=None, child_name="frame")
+    truth.joints[:] = [base, *truth.joints, mark]
+    assert is_mapped(bundle, truth)
+    truth.joints[1] = replace(hinge, parent=None, parent_name="a link without a shape")
+    assert not is_mapped(bundle, truth)
