@@ -194,7 +194,7 @@ def replaced(flags: tuple[str, ...], flag: str, value: object) -> tuple[str, ...
 
 def growths(extent: Extent, seeds: int) -> list[Point]:
     """One size after the other, from few steps: seconds matter, errors do not."""
-    short = ("effort.steps=100", "effort.merge_steps=50")
+    short = ("effort.steps=100", "effort.merge_steps=50", "effort.longest=2048")
     few = ("--train-views", "8", "--test-views", "1", "--resolution")
     points = []
     for seed in range(seeds):

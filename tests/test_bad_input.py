@@ -173,6 +173,12 @@ def test_an_unknown_root_is_refused(refused, hinge_capture, tmp_path):
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.parametrize("downscale", [-1, 0, 5])
+def test_images_made_larger_or_of_no_pixels_are_refused(refused, hinge_capture, tmp_path, downscale):
+    sentence = refused("fit", hinge_capture, "--output-dir", tmp_path / "new", "--downscale", downscale)
+    assert f"--downscale is {downscale}; give 1 to 4" in sentence and not (tmp_path / "new").exists()
+
+
 @pytest.mark.parametrize("seed", [-1, 2**32])
 def test_an_impossible_seed_is_refused(refused, hinge_capture, tmp_path, seed):
     assert f"--seed is {seed}" in refused("fit", hinge_capture, "--output-dir", tmp_path / "new", "--seed", seed)

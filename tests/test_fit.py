@@ -45,6 +45,7 @@ SETTINGS = {
     "joints": [],
     "worlds": "shared",
     "refine_cameras": "auto",
+    "downscale": 1,
 }
 
 
@@ -214,24 +215,49 @@ def test_the_users_word_on_a_joint_holds(fit_copy, hinge_capture, run_main):
     assert code == 2 and "body" in errors and "base, lid" in errors
 
 
-@pytest.mark.parametrize(("pixels", "times"), [((256, 300), 2), ((1000, 800), 2), ((255, 300), 1)])
-def test_a_draft_looks_at_smaller_images_where_enough_of_them_is_left(hinge_capture, tmp_path, pixels, times):
+@pytest.mark.parametrize(
+    ("first", "others", "times"),
+    [
+        ((256, 300), (800, 800), (2, 1, 1)),
+        ((255, 300), (800, 800), (1, 1, 1)),
+        ((801, 600), (800, 800), (4, 2, 1)),
+        ((1080, 1920), (1080, 1920), (6, 3, 2)),
+        ((4032, 3024), (800, 800), (6, 6, 3)),
+    ],
+)
+def test_large_images_and_those_of_drafts_are_looked_at_smaller_where_enough_is_left(
+    hinge_capture, tmp_path, first, others, times
+):
     from splatart_ns.capture.formats import load_capture
     from splatart_ns.plugin.settings import Settings
     from splatart_ns.plugin.stage_configs import stage_configs
 
     capture = load_capture(hinge_capture)
-    sizes = iter([pixels])
+    sizes = iter([first])
 
     def resized(frame):
-        width, height = next(sizes, (1000, 1000))
+        width, height = next(sizes, others)
         return replace(frame, camera=replace(frame.camera, width=width, height=height))
 
     states = [replace(state, frames=tuple(map(resized, state.frames))) for state in capture.states]
     capture = replace(capture, states=states)
-    for quality, expected in [("draft", times), ("standard", 1)]:
-        for config in stage_configs(capture, tmp_path, Settings(quality, None, 0)).values():
-            assert config.pipeline.datamanager.camera_res_scale_factor == 1 / expected
+    for quality, expected in zip(("draft", "standard", "high"), times, strict=True):
+        for downscale, wanted in [(None, expected), (1, 1), (5, 5)]:
+            settings = Settings(quality, None, 0, downscale=downscale)
+            for config in stage_configs(capture, tmp_path, settings).values():
+                assert config.pipeline.datamanager.camera_res_scale_factor == 1 / wanted
+
+
+def test_a_fit_says_how_much_smaller_it_looks_at_images(hinge_capture, tmp_path, monkeypatch, capsys):
+    from splatart_ns.plugin import fit as fits
+    from splatart_ns.plugin import settings
+
+    monkeypatch.setattr(fits, "_train", lambda *_, **__: None)
+    monkeypatch.setattr(fits, "_tell", lambda *_: None)
+    monkeypatch.setattr(settings, "SMALLEST", 20)
+    for downscale, told in {None: True, 2: False}.items():
+        fits.fit(hinge_capture, tmp_path / f"new_{downscale}", "draft", downscale=downscale)
+        assert ("1/2 of their size; --downscale 1" in " ".join(capsys.readouterr().out.split())) == told
 
 
 def test_a_fit_says_first_what_check_warns_of(hinge_capture, tmp_path, monkeypatch, capsys):

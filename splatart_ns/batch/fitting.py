@@ -57,7 +57,7 @@ class Fitting:
         check = Stage("check", stage_key("check", package, fingerprint, settings["quality"], last))
         if told is None:
             return [check]
-        # How much smaller all states' images are looked at, the smallest image of any of them decides.
+        # How much smaller all states' images are looked at, the sizes of all of them decide.
         fitting = [settings["quality"], settings["seed"], self.rasterizer, told["downscale"]]
 
         def needs(pixels: int) -> Needs:
@@ -123,20 +123,21 @@ class Fitting:
 def _check(work: Work, settings: Settings) -> dict[str, Any]:
     """Whether the capture can be fitted, what it is, and how much of it there is to hold in memory."""
     from splatart_ns.capture.digest import capture_digest
-    from splatart_ns.plugin.settings import image_downscale, require_fittable
+    from splatart_ns.plugin.settings import require_fittable
 
     with work.capture() as path:
         capture = require_fittable(path, settings)
+        downscale = settings.of(capture).downscale
         shared = repr((capture.normalization.centre.tolist(), capture.normalization.scale))
         return {
             "digest": capture_digest(capture),
             "worlds": capture.worlds,
-            "downscale": image_downscale(capture, settings.quality),
+            "downscale": downscale,
             "states": [
                 {
                     "name": state.name,
                     "digest": stage_key(capture_digest(capture, [state]), shared),
-                    "pixels": sum(frame.camera.width * frame.camera.height for frame in state.frames),
+                    "pixels": sum(f.camera.width * f.camera.height for f in state.frames) // downscale**2,
                 }
                 for state in capture.states
             ],

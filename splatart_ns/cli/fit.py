@@ -37,6 +37,9 @@ class Fit:
     is chosen. By default what the capture says."""
     refine_cameras: RefineCameras = "auto"
     """Whether to correct the cameras' poses; auto does where the silhouettes contradict each other."""
+    downscale: int | None = None
+    """How many times smaller than they are to look at images: 1 at all their pixels. By default at no more than 800
+    along the longer side, with --quality high 1600, and for a draft half as many."""
     rasterizer: Rasterizer = "auto"
     """auto takes gsplat on CUDA, else numba where it is installed, else torch."""
 
@@ -52,4 +55,4 @@ class Fit:
 
             choose_rasterizer(self.rasterizer)
             how = (self.quality, self.root, self.seed, self.rasterizer, self.joint, self.worlds, self.refine_cameras)
-            fit(self.capture, self.output_dir, *how, companions)
+            fit(self.capture, self.output_dir, *how, self.downscale, companions)

@@ -42,6 +42,7 @@ def fit(
     joints: tuple[str, ...] = (),
     worlds: Worlds | None = None,
     refine_cameras: RefineCameras = "auto",
+    downscale: int | None = None,
     companions: Companions | None = None,
 ) -> Path:
     """Run what is missing of all stages, leave the bundle in `output_dir` and say what it holds.
@@ -52,7 +53,7 @@ def fit(
         InputError: for a capture, a root, a joint, a folder or a rasterizer that cannot be used.
     """
     set_backend(rasterizer)
-    settings = Settings(quality, root, seed, rasterizer, list(joints), worlds, refine_cameras)
+    settings = Settings(quality, root, seed, rasterizer, list(joints), worlds, refine_cameras, downscale)
     warnings: list[Problem] = []
     capture = require_fittable(capture_path, settings, warnings.append)
     folders = {capture_path / s.name for s in capture.states}
@@ -67,6 +68,8 @@ def fit(
             CONSOLE.log(f"Warning: {warning}.", markup=False)
         if more := len(warnings[MOST_WARNINGS:]):
             CONSOLE.log(f"And {more} more warnings, see `splatart check {capture_path}`.", markup=False)
+        if downscale is None and (chosen := settings.of(capture).downscale) > 1:
+            CONSOLE.log(f"Images are looked at at 1/{chosen} of their size; --downscale 1 takes all their pixels.")
         configs = stage_configs(capture, output_dir, settings)
         pose, joint = (configs.pop(name) for name in ("pose", "joint"))
         with kernel_threads(num_cores()), _progress() as progress:

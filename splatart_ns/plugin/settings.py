@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,10 +26,12 @@ class Settings:
     joints: list[str] = field(default_factory=list)
     worlds: Worlds | None = None
     refine_cameras: RefineCameras = "auto"
+    downscale: int | None = None
 
     def of(self, capture: Capture) -> Settings:
         """With what the capture says where nothing else was asked for."""
-        return replace(self, worlds=self.worlds or capture.worlds)
+        downscale = self.downscale or image_downscale(capture, self.quality)
+        return replace(self, worlds=self.worlds or capture.worlds, downscale=downscale)
 
 
 @dataclass(frozen=True)
@@ -43,17 +46,21 @@ class Effort:
     """Steps on the parts of each state, which start from the labels' votes."""
     merge_steps: int
     """Steps on the merged Gaussians of all states."""
+    longest: int = 800
+    """Most pixels along the longer side with which images are looked at."""
     downscale: int = 1
-    """How many times smaller than they are images are looked at, where `SMALLEST` are left."""
+    """How many times smaller than that they are looked at, where `SMALLEST` are left."""
 
 
 EFFORTS: dict[Quality, Effort] = {
     "draft": Effort(gaussians=4000, steps=450, part_steps=30, merge_steps=100, downscale=2),
     "standard": Effort(gaussians=8000, steps=1000, part_steps=100, merge_steps=400),
-    "high": Effort(gaussians=16000, steps=3000, part_steps=100, merge_steps=1500),
+    "high": Effort(gaussians=16000, steps=3000, part_steps=100, merge_steps=1500, longest=1600),
 }
 SMALLEST = 128
 """Along the shorter side of images that are made smaller."""
+LEAST_LEFT = 16
+"""Along the same, of images that the user wants smaller."""
 
 
 def require_fittable(capture_path: Path, settings: Settings, warn: Callable[[Problem], None] | None = None) -> Capture:
@@ -72,11 +79,19 @@ def require_fittable(capture_path: Path, settings: Settings, warn: Callable[[Pro
     number = next((p for p, name in capture.parts.items() if name == root), None)
     parse_constraints(settings.joints, capture.parts, number)
     require_seed(settings.seed)
+    most = max(1, min(min(size) for size in _image_sizes(capture)) // LEAST_LEFT)
+    if settings.downscale is not None and not 1 <= settings.downscale <= most:
+        raise InputError(f"--downscale is {settings.downscale}; give 1 to {most}, or leave it out.")
     return capture
 
 
 def image_downscale(capture: Capture, quality: Quality) -> int:
-    """How many times smaller than they are the images of all states are looked at."""
-    cameras = [frame.camera for state in capture.states for frame in state.frames]
-    least = min(min(camera.width, camera.height) for camera in cameras)
-    return max(1, min(EFFORTS[quality].downscale, least // SMALLEST))
+    """How many times smaller than they are a quality looks at the images of all states."""
+    sizes, effort = _image_sizes(capture), EFFORTS[quality]
+    factor = effort.downscale * math.ceil(max(max(size) for size in sizes) / effort.longest)
+    return max(1, min(factor, min(min(size) for size in sizes) // SMALLEST))
+
+
+def _image_sizes(capture: Capture) -> set[tuple[int, int]]:
+    """Widths and heights in pixels."""
+    return {(frame.camera.width, frame.camera.height) for state in capture.states for frame in state.frames}

@@ -12,7 +12,7 @@ from splatart_ns.capture.capture import Capture
 from splatart_ns.method_configs.joint import method as joint_method
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.method_configs.semantic import method as semantic_method
-from splatart_ns.plugin.settings import EFFORTS, Settings, image_downscale
+from splatart_ns.plugin.settings import EFFORTS, Settings
 from splatart_ns.rasterize.rasterization import default_device
 
 
@@ -72,7 +72,7 @@ def _placed(
     """With its capture, its run folder, and none of what `ns-train` shows and saves meanwhile."""
     config.data = capture.path.absolute()
     config.pipeline.datamanager.data = config.data
-    config.pipeline.datamanager.camera_res_scale_factor = 1 / image_downscale(capture, settings.quality)
+    config.pipeline.datamanager.camera_res_scale_factor = 1 / settings.downscale
     config.pipeline.datamanager.dataparser.data = config.data
     config.pipeline.datamanager.dataparser.state = state
     config.pipeline.datamanager.dataparser.worlds = settings.worlds
