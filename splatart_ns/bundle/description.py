@@ -8,6 +8,9 @@ from splatart_ns.bundle.bundle import Bundle, Joint
 from splatart_ns.bundle.joint_axis import direction_deviation
 from splatart_ns.bundle.sliders import bundle_sliders
 
+_UNKNOWN = 1.0
+"""Standard deviation of an axis, radians, from which on it says nothing: lines of any direction are as far apart."""
+
 
 def part_depths(bundle: Bundle) -> list[tuple[str, int]]:
     """All parts, each followed by those that hang on it, with the number of joints between it and the root."""
@@ -29,7 +32,9 @@ def describe_joint(joint: Joint) -> str:
     if joint.ambiguous:
         text += ", ambiguous"
     deviation = direction_deviation(joint)
-    return text if deviation is None else f"{text}, axis ± {math.degrees(deviation):.2g} degree"
+    if deviation is None:
+        return text
+    return f"{text}, axis " + (f"± {math.degrees(deviation):.2g} degree" if deviation < _UNKNOWN else "unknown")
 
 
 def describe_part(bundle: Bundle, name: str) -> str:

@@ -19,6 +19,8 @@ def test_a_joint_says_how_certain_its_axis_and_its_parent_are(bundle):
     hinge.alternatives.clear()
     assert describe_joint(hinge) == "revolute on base, ambiguous, axis ± 0.57 degree"
     assert describe_joint(slide) == "prismatic on door"
+    hinge.covariance["axis"] = [[4.0, 0, 0], [0, 1e-6, 0], [0, 0, 0]]
+    assert describe_joint(hinge) == "revolute on base, ambiguous, axis unknown"
 
 
 def test_every_part_has_a_line_under_what_it_hangs_on_and_every_loop_one_at_the_end(bundle):
