@@ -38,7 +38,8 @@ def test_a_checkpoint_that_finds_no_room_is_refused_in_one_sentence(configs, mon
 def configs(hinge_capture, tmp_path):
     """A few steps of stage 1 for both states of a capture that a test may spoil."""
     capture = load_capture(shutil.copytree(hinge_capture, tmp_path / "capture"))
-    configs = [_semantic_config(capture, k, tmp_path / "runs", Settings("draft", None, 0)) for k in range(2)]
+    settings = Settings("draft", None, 0).of(capture)
+    configs = [_semantic_config(capture, k, tmp_path / "runs", settings) for k in range(2)]
     for config in configs:
         config.max_num_iterations, config.pipeline.model.semantic_start = 4, 2
         config.pipeline.datamanager.seed_gaussians = 100
