@@ -39,7 +39,7 @@ class Fit:
     """Whether to correct the cameras' poses; auto does where the silhouettes contradict each other."""
     downscale: int | None = None
     """How many times smaller than they are to look at images: 1 at all their pixels. By default so that no more than
-    800 are left along the longer side, with --quality high 1600; and of these a draft takes half, if that leaves 128."""
+    800 are left along the longer side, with --quality high 1600; a draft takes half of these, if that leaves 128."""
     rasterizer: Rasterizer = "auto"
     """auto takes gsplat on CUDA, else numba where it is installed, else torch."""
 
