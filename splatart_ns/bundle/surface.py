@@ -49,10 +49,21 @@ _BLIND = math.cos(math.radians(35))
 """Into what views from directions that differ by more than this from all cameras' see no camera looked. (With 25 to 45
 degrees meshes of eight pieces of furniture come equally near the truth in the mean: the smaller, the fuller is a box
 on the ground, and the further off a cupboard on a skirting.)"""
+_GRAZING = math.sin(math.radians(10))
+"""What a camera sees at a smaller angle than this, it hardly sees."""
 _HIDDEN = 2.0
 """What lies so much further than what stands before it is hidden by that, voxels."""
 _FRONT_PIXELS = 128
 """Most pixels along a side of the images of what stands before a part."""
+_LEVEL = 1.4
+"""Outer surfaces lie so many times as far before the middles of Gaussians as where half of their opacity is passed
+(the surface of Gaussian Opacity Fields, Yu et al. 2024): silhouettes keep all of them inside, and so the middles 1.5 to
+2.3 standard deviations below the surface (docs/export.md)."""
+_OUTSIDE = 0.06
+"""How deep within all silhouettes a surface is wholly an outer one, part's radii; at twice this it is none. The insides
+of hollows lie right, or too far out."""
+_FACING = 4.0
+"""An outer surface is wholly seen as one from directions within 76 degrees of its normal: the cosine times this."""
 _BAND = 3.0
 """Truncation of the signed distance, voxels."""
 _THICKEN = 0.75
@@ -72,19 +83,30 @@ class _DepthView:
     viewmat: Tensor
     K: Tensor
     image: Tensor
-    """Channels [5, H, W]: the accumulation, and times the accumulation: depth less _DISTANCE, colour."""
+    """Channels [6, H, W]: the accumulation, and times the accumulation: depth less _DISTANCE, colour, and how much
+    nearer the surface is where it is an outer one."""
     fronts: Tensor
     """Depth less _DISTANCE of what stands around the part, at each state [S, h, w], infinite where nothing does."""
     blind: bool
     """Whether no camera looked from about this direction, as far as that is known."""
 
-    def sample(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Accumulation [N], how far behind each of `points` [N, 3] the seen surface lies [N], its colour [N, 3]."""
+    def sample(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What is seen at `points` [N, 3]: accumulation [N], how far behind each the surface lies [N], its colour
+        [N, 3], and how much nearer it is if it is an outer one [N]."""
         uv, z = project_points(points, self.viewmat, self.K)
         at = (uv * (2 / self.image.shape[-1]) - 1)[None, None]
         values = F.grid_sample(self.image[None], at, align_corners=False)[0, :, 0]
         accumulation, rest = values[0], values[1:] / values[0].clamp_min(1e-6)
-        return accumulation, rest[0] - (z - _DISTANCE), rest[1:].T
+        return accumulation, rest[0] - (z - _DISTANCE), rest[1:4].T, rest[4]
+
+    def shows(self, points: Tensor, band: float) -> Tensor:
+        """At which of `points` [N, 3] the seen surface is, or within `band` of them [N] bool."""
+        accumulation, behind, _, nearer = self.sample(points)
+        return (accumulation > 0.5) & (behind > -band) & (behind < nearer + band)
+
+    def towards(self, points: Tensor) -> Tensor:
+        """Unit vectors from `points` [N, 3] to the camera [N, 3]."""
+        return F.normalize(-self.viewmat[:3, :3].mT @ self.viewmat[:3, 3] - points, dim=-1)
 
     def hidden(self, points: Tensor, voxel: float) -> Tensor:
         """Which of `points` [N, 3] lie behind what stands before the part in all states [N] bool; all do if blind."""
@@ -102,6 +124,49 @@ class _DepthView:
         z = depth[row, column] / accumulation[row, column] + _DISTANCE
         ray = (torch.stack([column, row], -1) + 0.5 - self.K[:2, 2]) / self.K[0, 0]
         return (F.pad(ray, (0, 1), value=1.0) * z[:, None] - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
+
+
+@dataclass(frozen=True)
+class _Outside:
+    """Where N points lie to the nearest place at which all silhouettes end."""
+
+    nearness: Tensor
+    """1 near it down to 0 deep inside [N]."""
+    direction: Tensor
+    """Towards it [N, 3], unit vectors."""
+
+    def share(self, towards: Tensor) -> Tensor:
+        """To what share [N], 0 to 1, a surface that is seen from the directions `towards` [N, 3] is an outer one."""
+        return self.nearness * (_FACING * (self.direction * towards).sum(-1)).clamp(0, 1)
+
+
+@dataclass(frozen=True)
+class _Hull:
+    """What lies within all silhouettes: a grid of signed distances to its border."""
+
+    origin: np.ndarray
+    spacing: float
+    depths: np.ndarray
+    """How deep inside nodes are [I, J, K], in the unit of points, negative outside."""
+
+    @classmethod
+    def of(cls, views: list[_DepthView], axes: list[Tensor], spacing: float) -> _Hull:
+        """The hull at the nodes that `axes` span, which are `spacing` apart."""
+        nodes = torch.cartesian_prod(*axes)
+        beside = sum((view.sample(nodes)[0] < 0.5).int() for view in views)
+        inside = np.pad((beside < _AGREEING).numpy().reshape([len(axis) for axis in axes]), 1)
+        depths = ndimage.distance_transform_edt(inside) - ndimage.distance_transform_edt(~inside)
+        smooth = ndimage.gaussian_filter(depths[1:-1, 1:-1, 1:-1].astype(np.float32), 1.0)
+        return cls(np.array([float(axis[0]) for axis in axes]), spacing, spacing * smooth)
+
+    def outside(self, points: Tensor) -> _Outside:
+        """For points [N, 3]."""
+        at = ((points.numpy() - self.origin) / self.spacing).T
+        depth, *inwards = (
+            torch.from_numpy(ndimage.map_coordinates(x, at, order=1, mode="nearest"))
+            for x in (self.depths, *np.gradient(self.depths))
+        )
+        return _Outside((2 - depth / _OUTSIDE).clamp(0, 1), -F.normalize(torch.stack(inwards, -1), dim=-1))
 
 
 @torch.no_grad()
@@ -282,17 +347,26 @@ def _look(splat: Splat, around: Sequence[Splat], direction: Tensor, blind: bool,
 
     z = transform_points(viewmat, splat.means)[:, 2]
     layer = ((z - z.min()) * (_SLICES / (z.max() - z.min()).clamp_min(1e-9))).long().clamp_max(_SLICES - 1)
-    planes = F.pad(_depth_planes(splat, viewmat, K), (1, 0), value=1.0)
+    depth_planes, thickness = _depth_planes(splat, viewmat, K)
+    nearer = _LEVEL * thickness * (2 * (2 * splat.opacities).clamp_min(1).log()).sqrt()
+    planes = F.pad(depth_planes, (1, 0), value=1.0)
     image, accumulation, _ = rasterization(
         *(splat.means, splat.quats, splat.scales, splat.opacities),
-        torch.cat([_base_colours(splat), (planes[:, :, None] * F.one_hot(layer, _SLICES)[:, None]).flatten(1)], 1),
+        torch.cat(
+            [
+                _base_colours(splat),
+                nearer[:, None],
+                (planes[:, :, None] * F.one_hot(layer, _SLICES)[:, None]).flatten(1),
+            ],
+            1,
+        ),
         *(viewmat[None], K[None], pixels, pixels),
         eps2d=PIXEL_VARIANCE,
     )
-    weight, at_centre, along_x, along_y = image[0, ..., 3:].unflatten(-1, (4, _SLICES)).unbind(-2)
+    weight, at_centre, along_x, along_y = image[0, ..., 4:].unflatten(-1, (4, _SLICES)).unbind(-2)
     from_centre = torch.arange(pixels)[:, None] + 0.5 - pixels / 2
     depth = _median_depth(weight, at_centre + along_x * from_centre + along_y * from_centre[:, None])
-    channels = torch.cat([accumulation[0], accumulation[0] * depth[..., None], image[0, ..., :3]], -1)
+    channels = torch.cat([accumulation[0], accumulation[0] * depth[..., None], image[0, ..., :4]], -1)
     size = min(pixels, _FRONT_PIXELS)
     smaller = torch.diag(torch.tensor([size / pixels, size / pixels, 1.0])) @ K
     fronts = [_front(other, viewmat, smaller, size) for other in around]
@@ -315,8 +389,10 @@ def _base_colours(splat: Splat) -> Tensor:
     return (0.5 + splat.sh[:, 0] / (2 * math.sqrt(math.pi))).clamp(0, 1)
 
 
-def _depth_planes(splat: Splat, viewmat: Tensor, K: Tensor) -> Tensor:
+def _depth_planes(splat: Splat, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """The depth less _DISTANCE of each Gaussian as a plane over the image [N, 3]: at the centre, per pixel along x, y.
+
+    And how thick it is along a ray [N], one standard deviation.
 
     Where a ray meets a Gaussian most densely is linear in the pixel, for the local affine camera of EWA splatting
     (Zwicker et al. 2001): the conditional mean of depth given the pixel. The centres' depths alone would make steps of
@@ -333,7 +409,8 @@ def _depth_planes(splat: Splat, viewmat: Tensor, K: Tensor) -> Tensor:
     # The rasterizer's own blur, without which the slopes of Gaussians seen on edge have no bound.
     seen = covariance[:, :2, :2] + PIXEL_VARIANCE * torch.eye(2)
     slope = torch.linalg.solve(seen, covariance[:, :2, 2])
-    return torch.cat([(z - _DISTANCE - (slope * offset).sum(-1))[:, None], slope], -1)
+    planes = torch.cat([(z - _DISTANCE - (slope * offset).sum(-1))[:, None], slope], -1)
+    return planes, (covariance[:, 2, 2] - (slope * covariance[:, :2, 2]).sum(-1)).clamp_min(0).sqrt()
 
 
 def _median_depth(weight: Tensor, moment: Tensor) -> Tensor:
@@ -358,9 +435,11 @@ def _zero_level(
     origin = -voxel * _COARSE * cells / 2
     axes = [torch.from_numpy(origin[k] + voxel * np.arange(_COARSE * cells[k] + 1)).float() for k in range(3)]
 
+    hull = _Hull.of(views, [axis[::2] for axis in axes], 2 * voxel)
+
     def field_at(nodes: Tensor) -> np.ndarray:
         points = torch.stack([axis[i] for axis, i in zip(axes, nodes.unbind(-1), strict=True)], -1)
-        return _field(views, points, voxel, extent).numpy()
+        return _field(views, points, voxel, extent, hull.outside(points)).numpy()
 
     coarse_nodes = torch.cartesian_prod(*[torch.arange(0, len(axis), _COARSE) for axis in axes])
     coarse = field_at(coarse_nodes).reshape(cells + 1)
@@ -389,7 +468,7 @@ def _upsampled(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def _field(views: list[_DepthView], points: Tensor, voxel: float, extent: Extent | None) -> Tensor:
+def _field(views: list[_DepthView], points: Tensor, voxel: float, extent: Extent | None, outside: _Outside) -> Tensor:
     """Truncated signed distance [N] at `points` [N, 3], positive where empty: what _AGREEING views at least find, and a
     _SHARE of those that see hardly past a point.
 
@@ -400,8 +479,8 @@ def _field(views: list[_DepthView], points: Tensor, voxel: float, extent: Extent
     within = None if extent is None else extent.holds(points)
     found, hardly = torch.empty(len(points), len(views)), torch.zeros(len(points))
     for k, view in enumerate(views):
-        accumulation, behind, _ = view.sample(points)
-        past = behind / voxel
+        accumulation, behind, _, nearer = view.sample(points)
+        past = (behind - nearer * outside.share(view.towards(points))) / voxel
         value = torch.maximum(((past - _THICKEN) / _BAND).clamp(-1, 1), 1 - 2 * accumulation)
         by_little = (accumulation > 0.5) & (past > 0) & (past < _HARDLY)
         if within is not None:
@@ -449,8 +528,7 @@ def _looked_at(views: list[_DepthView], towards: Tensor, mesh: trimesh.Trimesh, 
     seen = torch.zeros(len(points), dtype=torch.bool)
     for view, cosine, side in zip(views, cosines, towards[nearest].float(), strict=True):
         if cosine > _SAME_SIDE:
-            accumulation, behind, _ = view.sample(points)
-            seen |= (accumulation > 0.5) & (behind.abs() < band) & (normals @ side > 0)
+            seen |= view.shows(points, band) & (normals @ side > _GRAZING)
     return seen.numpy()
 
 
@@ -458,8 +536,8 @@ def _vertex_colours(views: list[_DepthView], points: Tensor, band: float) -> tup
     """Colours [N, 4] uint8 that the views see within `band` of points [N, 3], and whether any view sees them [N]."""
     total = torch.zeros(len(points), 4)
     for view in views:
-        accumulation, behind, colour = view.sample(points)
-        weight = accumulation * ((behind.abs() < band) & (accumulation > 0.5))
+        accumulation, _, colour, _ = view.sample(points)
+        weight = accumulation * view.shows(points, band)
         total += weight[:, None] * F.pad(colour, (0, 1), value=1.0)
     seen = total[:, 3] > 0
     # What nobody saw takes the mean colour.

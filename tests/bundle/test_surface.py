@@ -56,6 +56,20 @@ def test_a_closed_shape_is_found_again(true):
     assert np.sqrt((distances(mesh, true) ** 2).mean()) < 0.01
 
 
+def test_an_outer_face_lies_before_the_middles_of_its_gaussians():
+    box = trimesh.creation.box((1, 0.6, 0.4))
+    mesh = part_surface(splat_on(box, thickness=0.02), voxels=VOXELS)
+    assert_solid(mesh)
+    assert mesh.volume == pytest.approx(box.volume, rel=0.05)  # between the middles there is 0.69 of it
+    assert np.quantile(distances(mesh, box), 0.9) < 0.025
+
+
+def test_the_floor_of_a_hollow_lies_in_the_middle_of_its_gaussians():
+    mesh = part_surface(open_box(thickness=0.02, inwards=0.0), voxels=VOXELS)
+    x, y, z = mesh.vertices.T
+    assert z[(np.abs(x) < 0.3) & (np.abs(y) < 0.15)].max() == pytest.approx(-0.2, abs=0.02)
+
+
 def test_a_sheet_gets_a_thickness_and_stays_open():
     box = trimesh.creation.box((1, 0.6, 0.4))
     box.update_faces(box.face_normals[:, 2] < 0.5)
@@ -189,11 +203,11 @@ def test_no_extent_is_an_error():
         part_surface(few([[0.0, 0, 0]], (0.0, 0.0, 0.0)))
 
 
-def open_box():
+def open_box(**gaussians):
     """Without its upper face, at 0.2."""
     box = trimesh.creation.box((1, 0.6, 0.4))
     box.update_faces(box.face_normals[:, 2] < 0.5)
-    return splat_on(box, 5000)
+    return splat_on(box, 5000, **gaussians)
 
 
 def lying_on(box_at):
