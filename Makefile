@@ -14,10 +14,11 @@ $(READY): pyproject.toml
 demo: $(READY)
 	$(BIN)/splatart demo --output-dir demo
 
+# Files of tests go to two processes, so that fixtures of a file are made once.
 test: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses 2 --dist loadfile
 
 fuzz: $(READY)
 	SPLATART_FUZZ_EXAMPLES=2000 $(BIN)/pytest tests/*/test_fuzz*.py

@@ -58,7 +58,7 @@ _FRONT_PIXELS = 128
 _LEVEL = 1.4
 """Outer surfaces lie so many times as far before the middles of Gaussians as where half of their opacity is passed
 (the surface of Gaussian Opacity Fields, Yu et al. 2024): silhouettes keep all of them inside, and so the middles 1.5 to
-2.3 standard deviations below the surface (docs/export.md)."""
+2.4 standard deviations below the surface (docs/export.md)."""
 _OUTSIDE = 0.06
 """How deep within all silhouettes a surface is wholly an outer one, part's radii; at twice this it is none. The insides
 of hollows lie right, or too far out."""

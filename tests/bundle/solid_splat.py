@@ -16,7 +16,7 @@ def splat_on(
     """Flat Gaussians on a mesh; colour is green where x > 0, else red.
 
     By default a tenth as thick as wide. Their middles lie so many thicknesses below the surface; fits leave them at 1.5
-    to 2.3 (docs/export.md).
+    to 2.4 (docs/export.md).
     """
     points, face = trimesh.sample.sample_surface(mesh, n, seed=0)
     z = mesh.face_normals[face]
