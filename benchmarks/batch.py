@@ -94,7 +94,7 @@ def scheduling(output_dir: Path, objects: int = 10_000) -> None:
         (folder / "capture.txt").write_text(str(number))
     manifest = output_dir / "list.csv"
     manifest.write_text("path\n" + "".join(f"captures/{n // 1000:03d}/{n:06d}\n" for n in range(objects)))
-    settings = {"quality": "draft", "root": None, "seed": 0, "joints": []}
+    settings = {"quality": "draft", "root": None, "seed": 0, "downscale": None, "joints": []}
     for what in ("first run", "nothing to do"):
         start, cpu = time.perf_counter(), time.process_time()
         entries = read_entries(str(manifest), settings)
@@ -140,7 +140,7 @@ def cluster(captures: list[Path], output_dir: Path, quality: str = "draft") -> N
     """A local Ray cluster of two nodes, one of them killed when a third of the stages have ended."""
     from ray.cluster_utils import Cluster
 
-    settings = {"quality": quality, "root": None, "seed": 0, "joints": []}
+    settings = {"quality": quality, "root": None, "seed": 0, "downscale": None, "joints": []}
     entries = [Entry(capture.name, str(capture.resolve()), settings) for capture in captures]
     here, there = open_storage(str(output_dir / "here")), open_storage(str(output_dir / "there"))
     count = Count(entries)

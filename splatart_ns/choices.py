@@ -23,3 +23,9 @@ def require_seed(seed: Any, what: str = "--seed") -> None:
     """Raises InputError for anything but a whole number below 2^32."""
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
         raise InputError(f"{what} is {seed!r}; give 0 to {2**32 - 1}.")
+
+
+def require_downscale(downscale: Any, what: str = "--downscale") -> None:
+    """Raises InputError for anything but a whole number above 0, or None."""
+    if downscale is not None and (isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1):
+        raise InputError(f"{what} is {downscale!r}; give 1 or more, or leave it out.")

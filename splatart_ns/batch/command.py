@@ -16,7 +16,7 @@ from splatart_ns.batch.progress import LiveProgress
 from splatart_ns.batch.shards import Sharding, ShardOptions, Shards, check_no_others, find_bundles
 from splatart_ns.batch.stage import Recipe
 from splatart_ns.batch.storage import open_storage
-from splatart_ns.choices import require_seed
+from splatart_ns.choices import require_downscale, require_seed
 
 ALL_DONE, SOME_FAILED, ALL_FAILED = 0, 3, 4
 """Exit codes."""
@@ -34,6 +34,7 @@ def fit_captures(
 ) -> int:
     """Fit all captures of a source, see `read_entries`; returns the exit code."""
     require_seed(settings["seed"])
+    require_downscale(settings["downscale"])
     recipe = Fitting(rasterizer, tuple(dict.fromkeys(exports)))
     entries = read_entries(source, settings)
     check_apart(entries, open_storage(out_url))

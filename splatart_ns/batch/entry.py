@@ -13,7 +13,7 @@ from pathlib import PurePath
 from typing import Any, get_args
 
 from splatart_ns.batch.storage import Folder, Storage, join, open_storage, require_folder
-from splatart_ns.choices import Quality, require_seed
+from splatart_ns.choices import Quality, require_downscale, require_seed
 from splatart_ns.errors import InputError
 
 _TRANSFORMS = "transforms.json"
@@ -22,7 +22,7 @@ _MARKS = (
     {"init_keyframes.yml", "cam_K.txt"},  # DTA
 )
 """Files of captures in other layouts, see `capture.peer_layouts`."""
-_SETTINGS = ("quality", "root", "seed", "joints")
+_SETTINGS = ("quality", "root", "seed", "downscale", "joints")
 _LONGEST_NAME, _DEEPEST = 150, 100
 
 
@@ -35,14 +35,15 @@ class Entry:
     capture: str
     """Folder or URL of the capture."""
     settings: dict[str, Any] = field(default_factory=dict)
-    """quality, root, seed, joints, as in `splatart fit`."""
+    """quality, root, seed, downscale, joints, as in `splatart fit`."""
 
 
 def read_entries(source: str, settings: dict[str, Any]) -> list[Entry]:
     """The captures below a folder or URL, or, of a .csv or .jsonl, its rows; in order.
 
     A manifest has the columns or keys `path` (relative to the manifest's folder) and, if wanted, `name`, `quality`,
-    `root`, `seed` and `joints` (in a CSV with `;` between them); what a row does not say is as in `settings`.
+    `root`, `seed`, `downscale` and `joints` (in a CSV with `;` between them); what a row does not say is as in
+    `settings`.
 
     Raises:
         InputError: no capture, no such folder, or a manifest that cannot be used; it names the line.
@@ -137,8 +138,9 @@ def _csv_rows(source: str, text: str) -> Iterable[tuple[int, dict[str, Any]]]:
             row = {key.strip(): value.strip() for key, value in row.items() if value.strip()}
             if "joints" in row:
                 row["joints"] = [joint.strip() for joint in row["joints"].split(";") if joint.strip()]
-            if re.fullmatch("[0-9]{1,10}", row.get("seed", "")):
-                row["seed"] = int(row["seed"])
+            for key in ("seed", "downscale"):
+                if re.fullmatch("[0-9]{1,10}", row.get(key, "")):
+                    row[key] = int(row[key])
             yield reader.line_num, row
     except csv.Error as error:
         raise InputError(f"{source}, line {reader.line_num}: is no CSV ({error}); mend it.") from None
@@ -169,6 +171,7 @@ def _entry(where: str, row: dict[str, Any], folder: str, settings: dict[str, Any
     if row.get("quality", "draft") not in get_args(Quality):
         raise InputError(f"{where}: 'quality' is {row['quality']!r}; give one of {', '.join(get_args(Quality))}.")
     require_seed(row.get("seed", 0), f"{where}: 'seed'")
+    require_downscale(row.get("downscale"), f"{where}: 'downscale'")
     joints = row.get("joints", [])
     if not isinstance(joints, list) or not all(isinstance(joint, str) for joint in joints):
         raise InputError(f"{where}: 'joints' is {joints!r}; give a list of texts.")

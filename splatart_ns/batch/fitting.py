@@ -54,7 +54,8 @@ class Fitting:
     def stages(self, entry: Entry, fingerprint: str, told: dict[str, Any] | None) -> list[Stage]:
         package, settings = version("splatart-ns"), entry.settings
         last = [settings["root"], settings["joints"]]
-        check = Stage("check", stage_key("check", package, fingerprint, settings["quality"], last))
+        looks = [settings["quality"], settings["downscale"]]
+        check = Stage("check", stage_key("check", package, fingerprint, looks, last))
         if told is None:
             return [check]
         # How much smaller all states' images are looked at, the sizes of all of them decide.
@@ -117,7 +118,10 @@ class Fitting:
             from splatart_ns.plugin.settings import Settings
 
         given = work.entry.settings
-        return Settings(given["quality"], given["root"], given["seed"], self.rasterizer, list(given["joints"]))
+        return Settings(
+            *(given["quality"], given["root"], given["seed"], self.rasterizer, list(given["joints"])),
+            downscale=given["downscale"],
+        )
 
 
 def _check(work: Work, settings: Settings) -> dict[str, Any]:

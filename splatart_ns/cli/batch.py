@@ -21,12 +21,14 @@ class Batch:
 
     root: Annotated[str, tyro.conf.Positional]
     """A folder above captures, or a manifest: .csv or .jsonl with path, and optionally name, quality, root, seed,
-    joints. Folders may be fsspec URLs (s3://, gs://)."""
+    downscale, joints. Folders may be fsspec URLs (s3://, gs://)."""
     output_dir: str
     """A folder or an fsspec URL."""
     quality: Quality = "standard"
     """As in `splatart fit`."""
     seed: int = 0
+    """As in `splatart fit`."""
+    downscale: int | None = None
     """As in `splatart fit`."""
     export: Annotated[tuple[tuple[Format, ...], ...], tyro.conf.UseAppendAction] = ()
     """Write these formats, too."""
@@ -40,7 +42,7 @@ class Batch:
     def run(self) -> None:
         from splatart_ns.batch.command import fit_captures
 
-        settings = {"quality": self.quality, "root": None, "seed": self.seed, "joints": []}
+        settings = {"quality": self.quality, "root": None, "seed": self.seed, "downscale": self.downscale, "joints": []}
         how = (self.rasterizer, sum(self.export, ()), self.address, self.retry_failed)
         raise SystemExit(fit_captures(self.root, self.output_dir, settings, *how, CONSOLE))
 

@@ -8,7 +8,7 @@ from splatart_ns.batch.entry import check_apart, read_entries
 from splatart_ns.batch.storage import open_storage
 from splatart_ns.errors import InputError
 
-SETTINGS = {"quality": "standard", "root": None, "seed": 0, "joints": []}
+SETTINGS = {"quality": "standard", "root": None, "seed": 0, "downscale": None, "joints": []}
 
 
 @pytest.fixture
@@ -109,13 +109,14 @@ def test_captures_in_an_object_store_are_found(object_store):
 def test_a_csv_says_what_is_special_about_an_object(make, tmp_path):
     make(
         "list.csv",
-        "path,name,quality,root,seed,joints,,\ncaps/a,,,,,,,\n/b,bee,draft,base,7,lid:base=revolute; knob:lid;,,\n",
+        "path,name,quality,root,seed,downscale,joints,,\ncaps/a,,,,,,,,\n"
+        "/b,bee,draft,base,7,3,lid:base=revolute; knob:lid;,,\n",
     )
     first, second = read_entries(str(tmp_path / "list.csv"), SETTINGS)
     assert (first.name, first.capture, first.settings) == ("a", f"{tmp_path}/caps/a", SETTINGS)
     assert (second.name, second.capture) == ("bee", "/b")
     joints = ["lid:base=revolute", "knob:lid"]
-    assert second.settings == {"quality": "draft", "root": "base", "seed": 7, "joints": joints}
+    assert second.settings == {"quality": "draft", "root": "base", "seed": 7, "downscale": 3, "joints": joints}
 
 
 def test_json_lines_do_so_too(make, tmp_path):
@@ -133,6 +134,8 @@ def test_json_lines_do_so_too(make, tmp_path):
         ("name\na\n", "line 2: 'path' is missing"),
         ("path,colour\na,red\n", "line 2: 'colour' is unknown"),
         ("path,seed\na,-1\n", "line 2: 'seed' is '-1'"),
+        ("path,downscale\na,0\n", "line 2: 'downscale' is 0; give 1 or more"),
+        ("path,downscale\na,half\n", "line 2: 'downscale' is 'half'"),
         ("path,quality\na,best\n", "'best'; give one of draft, standard, high"),
         ("path,name\na\n", "line 2: has not as many fields"),
         ('path\n"a\n', "is no CSV"),

@@ -18,7 +18,7 @@ from splatart_ns.bundle import export
 from splatart_ns.capture.procedural import synthesize_object
 from splatart_ns.capture.synthesis_options import SynthesisOptions
 
-SETTINGS = {"quality": "draft", "root": None, "seed": 0, "joints": []}
+SETTINGS = {"quality": "draft", "root": None, "seed": 0, "downscale": None, "joints": []}
 
 
 @pytest.fixture(scope="module")
@@ -150,6 +150,9 @@ def test_smaller_images_of_one_state_train_the_others_anew(hinge_capture, tmp_pa
     assert (before["downscale"], after["downscale"]) == (2, 1)
     assert 4 * before["states"][0]["pixels"] == after["states"][0]["pixels"]
     assert keys["semantic state_00"] != new_keys["semantic state_00"]
+    asked = Entry("hinge", str(tmp_path / "capture"), SETTINGS | {"downscale": 2})
+    told, _ = Fitting().run("check", Work(asked, open_storage(str(tmp_path)), tmp_path / "work"))
+    assert told["downscale"] == 2
 
 
 def test_what_depends_on_a_setting_or_a_state_has_another_key():
@@ -171,6 +174,7 @@ def test_what_depends_on_a_setting_or_a_state_has_another_key():
     assert changed({"seed": 1}, told) == last | {"semantic s0", "semantic s1", "pose"}
     assert changed({}, told | {"downscale": 2}) == last | {"semantic s0", "semantic s1", "pose"}
     assert changed({"quality": "high"}, told) == set(first)
+    assert changed({"downscale": 2}, told) == {"check"}  # which tells of it
     assert changed({}, other_state) == last | {"semantic s1", "pose"}
     assert first["pose"].after == ("semantic s0", "semantic s1") and first["semantic s0"].after == ("check",)
     assert first["semantic s0"].needs.gpu and not first["joint"].needs.gpu
