@@ -20,6 +20,9 @@ from splatart_ns.errors import InputError
 _PLASTIC = 1.32471795724474602596
 """The root of x^3 = x + 1: multiples of 1/x and 1/x^2 cover a square evenly, however many there are (M. Roberts, The
 Unreasonable Effectiveness of Quasirandom Sequences, 2018)."""
+_FREE = 0.25
+"""How far the values of all states may be shifted, in distances between them: the less, the further two states are
+apart."""
 _MOST_STATES, _SIZED_BY = 100_000, 256
 """Configurations that there may be; so many of them say how large the object is."""
 
@@ -57,8 +60,8 @@ class Dataset:
     """Samples by number, 0 and up without end: the same object, options and number give the same sample.
 
     Every joint's range is cut into as many pieces as there are states, and each state has a value from another
-    piece, at the same place of each, so that any two states differ by a piece at least and many cover the range (a
-    Latin hypercube, evenly spaced). A joint's freedoms are drawn apart.
+    piece, evenly spaced from near one end of the range to near the other: any two states differ by more than a piece
+    (of two, by 0.8 of the range), and many cover it (a Latin hypercube). A joint's freedoms are drawn apart.
     """
 
     def __init__(self, splat: ArticulatedSplat, options: DatasetOptions | None = None):
@@ -85,8 +88,8 @@ class Dataset:
         for number, (name, joint) in enumerate(self.splat.joints.items()):
             rng = np.random.default_rng([self.options.seed, 0, number])
             low, high = np.array(joint.ranges).T
-            places = np.stack([rng.permutation(states) for _ in low], -1) + rng.uniform(size=len(low))
-            values = (low + (high - low) * places[state] / states).tolist()
+            places = np.stack([rng.permutation(states) for _ in low], -1) + _FREE * rng.uniform(size=len(low))
+            values = (low + (high - low) * places[state] / (states - 1 + _FREE)).tolist()
             q[name] = values if len(values) > 1 else values[0]
         return q
 
