@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 from torch import Tensor
 
+from splatart_ns.bundle.hull import Hull, Outside
 from splatart_ns.bundle.occlusion import Extent
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.camera import project_points
@@ -59,11 +60,6 @@ _LEVEL = 1.4
 """Outer surfaces lie so many times as far before the middles of Gaussians as where half of their opacity is passed
 (the surface of Gaussian Opacity Fields, Yu et al. 2024): silhouettes keep all of them inside, and so the middles 1.5 to
 2.4 standard deviations below the surface (docs/export.md)."""
-_OUTSIDE = 0.06
-"""How deep within all silhouettes a surface is wholly an outer one, part's radii; at twice this it is none. The insides
-of hollows lie right, or too far out."""
-_FACING = 4.0
-"""An outer surface is wholly seen as one from directions within 76 degrees of its normal: the cosine times this."""
 _BAND = 3.0
 """Truncation of the signed distance, voxels."""
 _THICKEN = 0.75
@@ -124,49 +120,6 @@ class _DepthView:
         z = depth[row, column] / accumulation[row, column] + _DISTANCE
         ray = (torch.stack([column, row], -1) + 0.5 - self.K[:2, 2]) / self.K[0, 0]
         return (F.pad(ray, (0, 1), value=1.0) * z[:, None] - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
-
-
-@dataclass(frozen=True)
-class _Outside:
-    """Where N points lie to the nearest place at which all silhouettes end."""
-
-    nearness: Tensor
-    """1 near it down to 0 deep inside [N]."""
-    direction: Tensor
-    """Towards it [N, 3], unit vectors."""
-
-    def share(self, towards: Tensor) -> Tensor:
-        """To what share [N], 0 to 1, a surface that is seen from the directions `towards` [N, 3] is an outer one."""
-        return self.nearness * (_FACING * (self.direction * towards).sum(-1)).clamp(0, 1)
-
-
-@dataclass(frozen=True)
-class _Hull:
-    """What lies within all silhouettes: a grid of signed distances to its border."""
-
-    origin: np.ndarray
-    spacing: float
-    depths: np.ndarray
-    """How deep inside nodes are [I, J, K], in the unit of points, negative outside."""
-
-    @classmethod
-    def of(cls, views: list[_DepthView], axes: list[Tensor], spacing: float) -> _Hull:
-        """The hull at the nodes that `axes` span, which are `spacing` apart."""
-        nodes = torch.cartesian_prod(*axes)
-        beside = sum((view.sample(nodes)[0] < 0.5).int() for view in views)
-        inside = np.pad((beside < _AGREEING).numpy().reshape([len(axis) for axis in axes]), 1)
-        depths = ndimage.distance_transform_edt(inside) - ndimage.distance_transform_edt(~inside)
-        smooth = ndimage.gaussian_filter(depths[1:-1, 1:-1, 1:-1].astype(np.float32), 1.0)
-        return cls(np.array([float(axis[0]) for axis in axes]), spacing, spacing * smooth)
-
-    def outside(self, points: Tensor) -> _Outside:
-        """For points [N, 3]."""
-        at = ((points.numpy() - self.origin) / self.spacing).T
-        depth, *inwards = (
-            torch.from_numpy(ndimage.map_coordinates(x, at, order=1, mode="nearest"))
-            for x in (self.depths, *np.gradient(self.depths))
-        )
-        return _Outside((2 - depth / _OUTSIDE).clamp(0, 1), -F.normalize(torch.stack(inwards, -1), dim=-1))
 
 
 @torch.no_grad()
@@ -435,7 +388,10 @@ def _zero_level(
     origin = -voxel * _COARSE * cells / 2
     axes = [torch.from_numpy(origin[k] + voxel * np.arange(_COARSE * cells[k] + 1)).float() for k in range(3)]
 
-    hull = _Hull.of(views, [axis[::2] for axis in axes], 2 * voxel)
+    nodes = [axis[::2] for axis in axes]
+    beside = sum((view.sample(torch.cartesian_prod(*nodes))[0] < 0.5).int() for view in views)
+    inside = (beside < _AGREEING).numpy().reshape([len(axis) for axis in nodes])
+    hull = Hull.of(inside, origin, 2 * voxel)
 
     def field_at(nodes: Tensor) -> np.ndarray:
         points = torch.stack([axis[i] for axis, i in zip(axes, nodes.unbind(-1), strict=True)], -1)
@@ -468,7 +424,7 @@ def _upsampled(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def _field(views: list[_DepthView], points: Tensor, voxel: float, extent: Extent | None, outside: _Outside) -> Tensor:
+def _field(views: list[_DepthView], points: Tensor, voxel: float, extent: Extent | None, outside: Outside) -> Tensor:
     """Truncated signed distance [N] at `points` [N, 3], positive where empty: what _AGREEING views at least find, and a
     _SHARE of those that see hardly past a point.
 

@@ -24,8 +24,8 @@ from splatart_ns.errors import InputError
 from splatart_ns.shape import has_shape
 
 SETTINGS = {"quality": "standard", "root": None, "seed": 0, "downscale": None, "joints": []}
-CSV = "path,name,quality,root,seed,joints\ncaps/a,,,,,\n/b,bee,draft,base,7,lid:base=revolute; knob:lid\n"
-ROW = {"path": "b", "name": "x/y", "quality": "high", "root": "base", "seed": 3, "joints": ["lid:base"]}
+CSV = "path,name,quality,root,seed,downscale,joints\ncaps/a,,,,,,\n/b,bee,draft,base,7,2,lid:base=revolute; knob:lid\n"
+ROW = {"path": "b", "name": "x/y", "quality": "high", "root": "base", "seed": 3, "downscale": 2, "joints": ["lid:base"]}
 
 
 def sound(entries):
