@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from splatart_ns.geometry.se3 import matrix_from_quat, quat_from_matrix, quat_multiply
-from splatart_ns.geometry.spherical_harmonics import rotate_sh
+from splatart_ns.geometry.spherical_harmonics import SH_C0, rotate_sh
 
 
 @dataclass
@@ -43,6 +43,11 @@ class Splat:
     def opacities(self) -> Tensor:
         """Opacities [N] in (0, 1)."""
         return self.opacity_logits.sigmoid()
+
+    @property
+    def base_colours(self) -> Tensor:
+        """Colours [N, 3] in 0..1 without what depends on the view: the constant band's."""
+        return (0.5 + SH_C0 * self.sh[:, 0]).clamp(0, 1)
 
     @property
     def sh_degree(self) -> int:

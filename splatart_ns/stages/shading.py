@@ -28,7 +28,7 @@ def hue(rgb: Tensor) -> Tensor:
 
 def without_shading(pair: PartPair) -> PartPair:
     """The pair with `hue` in the place of colours, in the views and of the Gaussians."""
-    splats = tuple(replace(s, sh=((hue(0.5 + SH_C0 * s.sh[:, 0]) - 0.5) / SH_C0)[:, None]) for s in pair.splats)
+    splats = tuple(replace(s, sh=((hue(s.base_colours) - 0.5) / SH_C0)[:, None]) for s in pair.splats)
     views = tuple(tuple(_without_shading(view) for view in of_state) for of_state in pair.views)
     return replace(pair, splats=splats, views=views)
 

@@ -101,9 +101,8 @@ class Renderer:
 
 
 def _in_colour(splat: Splat, colour: Tensor) -> Splat:
-    own = (0.5 + SH_C0 * splat.sh[:, :1]).clamp(0, 1)
-    shaded = colour * (_OWN_COLOUR + (1 - _OWN_COLOUR) * own.mean(-1, keepdim=True))
-    return replace(splat, sh=(shaded - 0.5) / SH_C0)
+    shaded = colour * (_OWN_COLOUR + (1 - _OWN_COLOUR) * splat.base_colours.mean(-1, keepdim=True))
+    return replace(splat, sh=((shaded - 0.5) / SH_C0)[:, None])
 
 
 def _faded(splat: Splat) -> Splat:
