@@ -38,9 +38,11 @@ from splatart_ns.stages.unseen_turn import turned_least, turned_unseen
 
 JointMethod = Literal["screw", "descent"]
 _SEEN_NOISE = 0.3
-"""Share of the noise that is left where the covariances of the motions are known. Measured on random objects: with 0.03
-only 89 % of the true lines lie in their 95 % regions; with all of it, a thin part that turned by 21 degrees about its
-own length counted as fixed."""
+"""Share of the noise that is left where the covariances of the motions are known: with all of it, a thin part that
+turned by 21 degrees about its own length counted as fixed."""
+_REGION_NOISE = 0.1
+"""Share of it in the regions that are stated of joints: of 114 true lines 113 lie in their 95 % regions, as with 0.3,
+and with 0.06 and 0.03 only 106 and 96 (docs/joints.md)."""
 _STACKED = 0.02
 """Cost of a joint that does not hang on the root: two drawers that touch each other and the body alike slide in the
 body both."""
@@ -164,8 +166,10 @@ def infer_tree(
     weighed = covariances
     if covariances is not None:
         tree, motions, weighed = turned_least(tree, points, motions, radius, **certainty)
-    errors = _pose_errors(points, motions, covariances, known, radius, floor)[0]
-    weights = _pose_errors(points, motions, weighed, known, radius, floor)[1]
+    regions, share = (noise, 1) if covariances is None else (_REGION_NOISE * noise, max(1, len(motions[root]) - 1) ** 2)
+    errors = _pose_errors(points, motions, covariances, known, radius, regions)
+    # In the weights noise counts for less beside what the images say, the more motions there are (docs/accuracy.md).
+    weights = _pose_errors(points, motions, weighed, known, radius, floor / share)
     tree = refine_tree(tree, points, motions, errors, weights)
     return tree if covariances is None else turned_unseen(tree, points, motions, covariances, errors, constraints)
 
@@ -215,21 +219,16 @@ def _pose_errors(
     known: Mapping[int, Tensor],
     radius: float,
     noise: float,
-) -> tuple[dict[int, Tensor], dict[int, Tensor]]:
-    """Covariances [S, 6, 6] of the motions by part id: for regions, and for the weights of the refinement."""
-    errors, weights = {}, {}
+) -> dict[int, Tensor]:
+    """Covariances [S, 6, 6] of the motions by part id, with the noise of the points."""
+    errors = {}
     for p, x in points.items():
         told = torch.zeros(6, 6, dtype=torch.float64, device=x.device)
         if covariances is not None:
             unknown = (10 * radius) ** 2 * torch.eye(6).to(told)
             told = torch.where(known[p][:, None, None], covariances[p].to(told), unknown)
-        # Regions need the points' noise, but beside what the images say it counts for less in the weights the more
-        # motions there are: measured, see docs/accuracy.md.
-        share = 1 if covariances is None else max(1, len(motions[p]) - 1) ** 2
-        errors[p], weights[p] = (
-            told + surface_error(x.double(), motions[p].double(), least, radius) for least in (noise, noise / share)
-        )
-    return errors, weights
+        errors[p] = told + surface_error(x.double(), motions[p].double(), noise, radius)
+    return errors
 
 
 def choose_root(

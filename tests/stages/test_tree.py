@@ -160,7 +160,7 @@ def test_a_hinge_elsewhere_than_its_parents_hangs_on_it():
 
 @pytest.mark.parametrize(
     ("states", "images", "of_errors", "of_weights"),
-    [(2, True, 0.3, 0.3), (4, True, 0.3, 0.3 / 9), (4, False, 1.0, 1.0)],
+    [(2, True, 0.1, 0.3), (4, True, 0.1, 0.3 / 9), (4, False, 1.0, 1.0)],
 )
 def test_points_count_for_less_beside_images_least_where_many_motions_are_weighed(
     monkeypatch, states, images, of_errors, of_weights
