@@ -41,7 +41,7 @@ _SEEN_NOISE = 0.3
 """Share of the noise that is left where the covariances of the motions are known: with all of it, a thin part that
 turned by 21 degrees about its own length counted as fixed."""
 _REGION_NOISE = 0.1
-"""Share of it in the regions that are stated of joints: of 114 true lines 113 lie in their 95 % regions, as with 0.3,
+"""Share of the noise in the regions stated of joints: of 114 true lines 113 lie in their 95 % regions, as with 0.3,
 and with 0.06 and 0.03 only 106 and 96 (docs/joints.md)."""
 _STACKED = 0.02
 """Cost of a joint that does not hang on the root: two drawers that touch each other and the body alike slide in the
