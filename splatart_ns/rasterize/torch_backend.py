@@ -28,7 +28,8 @@ from splatart_ns.rasterize.torch_binning import LAYERS, MAX_ALPHA, MIN_ALPHA, TI
 BLOCKS = 12
 """Most blocks of LAYERS pairs that a tile walks before tiles that are opaque are left."""
 SLOTS = 8192
-"""Pairs in one step."""
+"""Pairs in one step for each of torch's threads, up to `MOST_THREADS` of them."""
+MOST_THREADS = 4
 KEPT_BYTES = 24 * 2**20
 """Alphas and weights that forward keeps for backward, which composes again what is beyond."""
 MIN_TRANSMITTANCE = 1e-4
@@ -148,8 +149,8 @@ class _Step:
 class _Workspace:
     """Buffers for the largest step, shared by all steps: they fit the caches better than fresh ones."""
 
-    def __init__(self, like: Tensor, buffers: int) -> None:
-        slots = max(SLOTS, LAYERS * BLOCKS)
+    def __init__(self, like: Tensor, buffers: int, slots: int) -> None:
+        """slots: Of the largest step."""
         self.memory = like.new_empty(buffers, (slots + slots // LAYERS) * _PIXELS)
 
     def buffer(self, i: int, step: _Step, more: int = 0) -> Tensor:
@@ -164,13 +165,14 @@ class _Workspace:
         return step.blend(saturates, alpha, weight, self.buffer(0, step, 1))
 
 
-def _batches(tiles: Tensor, counts: Tensor) -> Iterator[tuple[Tensor, int]]:
-    """Tiles for one step each, and the blocks they need; counts of the pairs they have left, descending."""
+def _batches(tiles: Tensor, counts: Tensor, slots: int) -> Iterator[tuple[Tensor, int]]:
+    """Tiles for one step each of at most so many slots, and the blocks they need; counts of the pairs they have left,
+    descending."""
     blocks_needed = counts.add(LAYERS - 1).div(LAYERS, rounding_mode="floor").clamp_max(BLOCKS).tolist()
     first = 0
     while first < len(tiles):
         blocks = blocks_needed[first]
-        last = first + max(SLOTS // (LAYERS * blocks), 1)
+        last = first + slots // (LAYERS * blocks)
         yield tiles[first:last], blocks
         first = last
 
@@ -179,13 +181,14 @@ def _composite(pairs: Pairs, keep_steps: bool, kept_bytes: int) -> tuple[Tensor,
     """Sums of weights times colours [tiles, channels, pixels], and the steps for backward."""
     image = pairs.table.new_zeros(len(pairs.tiles), len(pairs.table) - 8, _PIXELS)
     transmittance = image.new_ones(len(image), _PIXELS)
-    workspace = _Workspace(image, 3)
+    most_slots = max(SLOTS * min(torch.get_num_threads(), MOST_THREADS), LAYERS * BLOCKS)
+    workspace = _Workspace(image, 3, most_slots)
     room = 2 * _PIXELS * (len(pairs) + 2 * LAYERS * len(image))
     kept = image.new_empty(min(room, kept_bytes // image.element_size()) if keep_steps else 0)
     active, counts = torch.arange(len(image), device=image.device), pairs.counts
     steps, layer = [], 0
     while len(active):
-        for tiles, blocks in _batches(active, counts):
+        for tiles, blocks in _batches(active, counts, most_slots):
             slots = pairs.slots(tiles, layer, blocks)
             step = _Step(tiles, slots, pairs.columns(slots, tiles), transmittance[tiles])
             size = slots.numel() * _PIXELS
@@ -219,7 +222,8 @@ def _backward(pairs: Pairs, steps: list[_Step], v_image: Tensor, N: int, absgrad
     if not steps:
         return rows.new_zeros(N, len(rows))
     basis = _monomials(v_image.dtype, v_image.device)
-    workspace = _Workspace(v_image, 3 if all(step.blended for step in steps) else 5)
+    buffers = 3 if all(step.blended for step in steps) else 5
+    workspace = _Workspace(v_image, buffers, max(step.slots.numel() for step in steps))
     behind = v_image.new_zeros(len(v_image), _PIXELS)
     later = v_image.new_ones(BLOCKS, BLOCKS).triu(1)
     for step in reversed(steps):
