@@ -109,7 +109,8 @@ def as_text(examination: Examination) -> str:
             aligned = (c.rjust(max(10, len(state))) for c, state in zip(cells, states, strict=True))
             lines.append("  ".join([part.ljust(width), *aligned]))
     lines += [f"label next: {frame.image}" for frame in examination.suggested]
-    lines.append(f"{examination.errors} errors, {len(examination.problems) - examination.errors} warnings")
+    counts = {"error": examination.errors, "warning": len(examination.problems) - examination.errors}
+    lines.append(", ".join(f"{count} {kind}{'s' * (count != 1)}" for kind, count in counts.items()))
     return "\n".join(lines)
 
 

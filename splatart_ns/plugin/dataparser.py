@@ -22,7 +22,7 @@ from splatart_ns.errors import InputError
 
 @dataclass
 class SplatartDataParserConfig(DataParserConfig):
-    """An articulated object at two or more states (see the README for the layouts that are read)."""
+    """An articulated object at two or more states (docs/captures.md has the layouts that are read)."""
 
     _target: type = field(default_factory=lambda: SplatartDataParser)
     state: int = 0

@@ -325,7 +325,7 @@ def test_json_says_the_same(capture):
 def test_what_is_no_capture_is_one_problem(tmp_path):
     examination = examine(tmp_path)
     assert examination.capture is None and examination.errors == len(examination.problems) == 1
-    assert as_text(examination).endswith("1 errors, 0 warnings")
+    assert as_text(examination).endswith("1 error, 0 warnings")
 
 
 @pytest.fixture(scope="module")
