@@ -37,7 +37,9 @@ from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_exte
 from splatart_ns.stages.pose_notes import doubtful_rest, ill_shown, open_turns, turns_alike, unknown_poses
 from splatart_ns.stages.reference import is_sure, reference_states, refine_known_poses, since_state_0
 from splatart_ns.stages.render_choice import InitialMotion, initial_motion
+from splatart_ns.stages.shared_labels import share_labels
 from splatart_ns.stages.siblings import slid_alike, slide_ways
+from splatart_ns.stages.silhouette import with_rendered_labels
 from splatart_ns.stages.thinning import BUDGET, MAX_VIEWS, ROUNDS, absences, expendable
 from splatart_ns.stages.visibility import HIDDEN, looked_at
 from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_views, world_record, world_sentence
@@ -173,9 +175,15 @@ class PosePipeline(VanillaPipeline):
             )
         what = (self.model.num_parts, device, self.datamanager.train_dataset.downscale)
         states = [read_state(capture, s, run, *what) for s, run in enumerate(runs)]
-        self.views = [state.views for state in states]
         self._cameras_refined = any(state.cameras_refined for state in states)
-        splats = [state.splat.select(state.splat.part_ids > 0) for state in states]
+        splats = [state.splat for state in states]
+        if capture.worlds == "shared":
+            splats = share_labels(splats, [state.views for state in states])
+        self.views = [
+            [with_rendered_labels(view, splat) for view in state.views]
+            for state, splat in zip(states, splats, strict=True)
+        ]
+        splats = [splat.select(splat.part_ids > 0) for splat in splats]
         # What lies behind the front of a shut drawer comes to light when the drawer moves, and is nothing but haze.
         looks = [looked_at(splat, views) for splat, views in zip(splats, self.views, strict=True)]
         splats = [splat.select(share >= HIDDEN) for splat, (_, share) in zip(splats, looks, strict=True)]
@@ -192,7 +200,7 @@ class PosePipeline(VanillaPipeline):
         self.model.start(splats, self._initial_poses(splats), self._frozen)
         # Gaussians learn labels that somebody gave: by those that they showed themselves, images come out worse.
         to_learn = [
-            [view if own else replace(view, labels=None) for view, own in zip(views, state.labelled, strict=True)]
+            [replace(view, labels=own.labels) for view, own in zip(views, state.views, strict=True)]
             for views, state in zip(self.views, states, strict=True)
         ]
         self._pairs = self._shuffled_pairs(to_learn)

@@ -19,7 +19,7 @@ from splatart_ns.plugin.compat import finished_runs, read_checkpoint, read_run_c
 from splatart_ns.plugin.gaussians import SPLAT_SHAPES, splat_from_state
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.exposure import at_gain
-from splatart_ns.stages.silhouette import rendered_silhouette, with_rendered_labels, with_silhouette
+from splatart_ns.stages.silhouette import rendered_silhouette, with_silhouette
 
 _SHAPES = {
     **{"_model.cameras_refined": (), "_model.trained_on": (32,)},
@@ -34,9 +34,7 @@ class LabelledState:
     splat: Splat
     views: list[View]
     """The training views, with the cameras that the run ended with. Each says where the object ends: parts are rendered
-    without what surrounds them. Those without labels, or whose labels contradict the others', have the splat's."""
-    labelled: list[bool]
-    """Which views have labels of their own."""
+    without what surrounds them. None of them has labels that contradict the others'."""
     cameras_refined: bool
 
 
@@ -63,9 +61,7 @@ def read_state(
         )
     views = [view.to(device) for view in learned_views(capture, state, checkpoint, downscale)]
     views = [with_silhouette(view) or rendered_silhouette(view, splat) for view in views]
-    labelled = [view.labels is not None for view in views]
-    views = [with_rendered_labels(view, splat) for view in views]
-    return LabelledState(splat, views, labelled, bool(checkpoint["_model.cameras_refined"]))
+    return LabelledState(splat, views, bool(checkpoint["_model.cameras_refined"]))
 
 
 def _require_trained_on(capture: Capture, state: int, run: Path, digest: list[int]) -> None:

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import torch
 
@@ -63,3 +64,14 @@ def test_few_gaussians_and_such_at_one_place_are_labelled():
     found = spread(one, one.part_logits, torch.tensor([True, False, False, False]))
     assert found.argmax(-1).tolist() == [1, 1, 1, 1] and found.isfinite().all()
     assert math.isclose(float(found[0].logsumexp(0)), float(WALL.part_logits[0].logsumexp(0)))
+
+
+def test_another_state_tells_what_rests_and_nothing_of_what_has_another_colour():
+    """The wall of one state, half of it told, lies where another state has a drawer in front, or its own wall."""
+    here, elsewhere = WALL, replace(WALL, part_logits=DRAWER.part_logits)
+    both, states = Splat.cat([here, elsewhere]), torch.arange(2).repeat_interleave(len(WALL))
+    told = torch.cat([here.means[:, 0] < 0.45, torch.ones(len(WALL), dtype=torch.bool)])
+    found = spread(both, both.part_logits, told, states).argmax(-1)[: len(WALL)]
+    assert (found[here.means[:, 0] > 1] == 2).all()  # as the other state's, which looks alike
+    painted = Splat.cat([here, replace(elsewhere, sh=elsewhere.sh + 1.0)])
+    assert (spread(painted, both.part_logits, told, states).argmax(-1)[: len(WALL)] == 1).all()
