@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -129,6 +129,24 @@ class PoseModel(SplatartModel):
         return super().load_state_dict(state, **kwargs)
 
 
+def seen_of_parts(
+    splats: Sequence[Splat], views: Sequence[Sequence[View]]
+) -> tuple[list[Splat], list[list[View]], list[Tensor], list[Tensor]]:
+    """The parts' Gaussians of each state that some view shows, the views with labels everywhere, and what they show of
+    each Gaussian: its `visibility`, and the share of it in the `clearest` view."""
+    everywhere = [[with_rendered_labels(view, s) for view in some] for s, some in zip(splats, views, strict=True)]
+    parts = [splat.select(splat.part_ids > 0) for splat in splats]
+    looks = [looked_at(splat, some) for splat, some in zip(parts, everywhere, strict=True)]
+    # What lies behind the front of a shut drawer comes to light when the drawer moves, and is nothing but haze.
+    shown = [share >= HIDDEN for _, share in looks]
+    return (
+        [splat.select(which) for splat, which in zip(parts, shown, strict=True)],
+        everywhere,
+        [seen[which] for (seen, _), which in zip(looks, shown, strict=True)],
+        [share[which] for (_, share), which in zip(looks, shown, strict=True)],
+    )
+
+
 @dataclass
 class PosePipelineConfig(LaterPipelineConfig):
     """Stage 2."""
@@ -176,22 +194,11 @@ class PosePipeline(VanillaPipeline):
         what = (self.model.num_parts, device, self.datamanager.train_dataset.downscale)
         states = [read_state(capture, s, run, *what) for s, run in enumerate(runs)]
         self._cameras_refined = any(state.cameras_refined for state in states)
-        splats = [state.splat for state in states]
-        if capture.worlds == "shared":
-            splats = share_labels(splats, [state.views for state in states])
-        self.views = [
-            [with_rendered_labels(view, splat) for view in state.views]
-            for state, splat in zip(states, splats, strict=True)
-        ]
-        splats = [splat.select(splat.part_ids > 0) for splat in splats]
-        # What lies behind the front of a shut drawer comes to light when the drawer moves, and is nothing but haze.
-        looks = [looked_at(splat, views) for splat, views in zip(splats, self.views, strict=True)]
-        splats = [splat.select(share >= HIDDEN) for splat, (_, share) in zip(splats, looks, strict=True)]
-        self._seen = [seen[share >= HIDDEN] for seen, share in looks]
-        self._clear = [share[share >= HIDDEN] for _, share in looks]
+        splats, views = [state.splat for state in states], [state.views for state in states]
         self.model.worlds = torch.from_numpy(np.stack([state.placement for state in capture.states])).to(device)
         if capture.worlds != "shared":
-            self._bring_together(splats, capture)
+            splats, views = self._brought_together(splats, views, capture)
+        splats, self.views, self._seen, self._clear = seen_of_parts(share_labels(splats, views), views)
         self._shown = [image_error(splat, views) for splat, views in zip(splats, self.views, strict=True)]
         S, P = len(splats), self.model.num_parts
         self._reference, self._known, self._frozen = [0] * P, torch.ones(S, P, dtype=torch.bool), torch.zeros(S, P) > 0
@@ -199,19 +206,17 @@ class PosePipeline(VanillaPipeline):
         self._alike: dict[tuple[int, int], InitialMotion] = {}  # by state and part
         self.model.start(splats, self._initial_poses(splats), self._frozen)
         # Gaussians learn labels that somebody gave: by those that they showed themselves, images come out worse.
-        to_learn = [
-            [replace(view, labels=own.labels) for view, own in zip(views, state.views, strict=True)]
-            for views, state in zip(self.views, states, strict=True)
-        ]
-        self._pairs = self._shuffled_pairs(to_learn)
-        self._own = self._shuffled_views(to_learn)
+        self._pairs = self._shuffled_pairs(views)
+        self._own = self._shuffled_views(views)
 
-    def _bring_together(self, splats: list[Splat], capture: Capture) -> None:
-        """Move splats and views of all states into the world of state 0."""
-        P = self.model.num_parts
+    def _brought_together(
+        self, splats: list[Splat], views: list[list[View]], capture: Capture
+    ) -> tuple[list[Splat], list[list[View]]]:
+        """Splats and views of all states in the world of state 0."""
+        objects, labelled, seen, _ = seen_of_parts(splats, views)
         root = next((p for p, name in capture.parts.items() if name == self.config.root), None)
-        parts = anchors(splats, self._seen, P) if root is None else [root]
-        found = fit_worlds(splats, self.views, self._seen, parts, capture.worlds == "similar", self.config.seed)
+        parts = anchors(objects, seen, self.model.num_parts) if root is None else [root]
+        found = fit_worlds(objects, labelled, seen, parts, capture.worlds == "similar", self.config.seed)
         if found is None:
             raise InputError(
                 f"{capture.path}: no part is seen well enough in all states to bring their worlds together; label "
@@ -220,13 +225,14 @@ class PosePipeline(VanillaPipeline):
         part, fits = found
         self.findings["worlds"] = []
         for k, fit in enumerate(fits, start=1):
-            splats[k] = moved_splat(splats[k], fit.T)
-            self.views[k] = moved_views(self.views[k], fit.T)
             to_first = torch.from_numpy(capture.normalization.motion_to_world(fit.T.numpy(force=True)))
             self.model.worlds[k] = to_first.to(self.model.worlds) @ self.model.worlds[k]
             told = world_record(capture.states[k].name, self.model.part_names[part], self.model.worlds[k], fit)
             self.findings["worlds"].append(told)
             self._note([world_sentence(told, capture.states[0].name)])
+        moved = [moved_splat(splat, fit.T) for splat, fit in zip(splats[1:], fits, strict=True)]
+        seen_from = [moved_views(some, fit.T) for some, fit in zip(views[1:], fits, strict=True)]
+        return [splats[0], *moved], [views[0], *seen_from]
 
     def _initial_poses(self, splats: list[Splat]) -> Tensor:
         """Poses [S, P, 4, 4] to begin from; keeps in mind the reference states, and what is known and what stays."""
