@@ -87,6 +87,8 @@ class Examination:
     problems: tuple[Problem, ...]
     """Errors first."""
     coverage: tuple[Coverage, ...] = ()
+    shown: tuple[float, ...] = ()
+    """Of the surface that each state's training frames show, the share that labelled ones do; empty without hulls."""
     suggested: tuple[Frame, ...] = ()
     """The frames to label next, the most useful first."""
 
@@ -96,12 +98,14 @@ class Examination:
 
 
 def as_text(examination: Examination) -> str:
-    """Lines of problems, a table of what labelled frames show of the parts, the frames to label next, a sum."""
+    """Lines of problems, a table of what labelled frames show, the frames to label next, a sum."""
     lines = [f"{problem.severity}: {problem}" for problem in examination.problems]
     rows: dict[str, list[str]] = {}
     for item in examination.coverage:
         rows.setdefault(item.part, []).append(f"{item.frames} of {item.labelled}")
     states = list(dict.fromkeys(item.state for item in examination.coverage))
+    if min(examination.shown, default=1) < 1:
+        rows["of what all frames show"] = [f"{share:.0%}" for share in examination.shown]
     if rows:
         width = max(len("seen in labelled frames"), *map(len, rows))
         lines.append("  ".join(["seen in labelled frames".ljust(width), *(state.rjust(10) for state in states)]))
@@ -120,6 +124,7 @@ def as_json(examination: Examination) -> str:
         "errors": examination.errors,
         "problems": [{**asdict(problem), "file": str(problem.file)} for problem in examination.problems],
         "coverage": [asdict(item) for item in examination.coverage],
+        "shown": examination.shown,
         "label_next": [str(frame.image) for frame in examination.suggested],
     }
     return json.dumps(value, indent=1)
@@ -148,10 +153,15 @@ class _Evidence:
         return torch.stack(spreads) / self.normalization.scale
 
     def shown_by_labels(self) -> float:
-        """The share of the surface that views show which labelled views show, too."""
-        seen = {id(view): visible(view, self.points, self.size) for view in self.views}
-        labelled = torch.stack([seen[id(view)] for view in self.labelled]).any(0)
-        return float(labelled.sum() / torch.stack([*seen.values()]).any(0).sum().clamp_min(1))
+        """The share of the surface that training views show which labelled ones show, too."""
+        shown, told = torch.zeros(2, len(self.points), dtype=torch.bool)
+        for frame, view in zip(self.frames, self.views, strict=True):
+            if frame.split == "train":
+                seen = visible(view, self.points, self.size)
+                shown |= seen
+                if view.labels is not None:
+                    told |= seen
+        return float(told.sum() / shown.sum().clamp_min(1))
 
     @property
     def labelled(self) -> list[View]:
@@ -212,6 +222,7 @@ def examine(path: Path | str, suggest: int = 0) -> Examination:
         capture=capture,
         problems=tuple(sorted(dict.fromkeys(problems), key=lambda p: p.severity != "error")),
         coverage=tuple(_coverage(one, i, name) for i, name in capture.parts.items() for one in evidence),
+        shown=tuple(one.shown_by_labels() for one in evidence) if all(len(one.points) for one in evidence) else (),
         suggested=tuple(_suggest(evidence, num_parts, suggest)),
     )
 

@@ -320,6 +320,16 @@ def test_json_says_the_same(capture):
     assert value["problems"][0]["file"] == str(capture / LABELS)
     assert value["label_next"] == [str(examination.suggested[0].image)]
     assert value["coverage"][0] == {"state": "state_00", "part": "base", "frames": 6, "labelled": 6}
+    assert value["shown"] == list(examination.shown)
+
+
+def test_it_is_told_how_much_labelled_frames_show(capture):
+    assert "of what all frames show" not in as_text(examine(capture))
+    unlabel(capture, "state_00", range(1, 12))
+    examination = examine(capture)
+    first, second = examination.shown
+    assert 0.1 < first < 0.7 and second == 1  # one view sees less than half of a solid
+    assert f"of what all frames show  {f'{first:.0%}':>10}  {'100%':>10}" in as_text(examination)
 
 
 def test_what_is_no_capture_is_one_problem(tmp_path):
