@@ -216,7 +216,8 @@ class PosePipeline(VanillaPipeline):
         objects, labelled, seen, _ = seen_of_parts(splats, views)
         root = next((p for p, name in capture.parts.items() if name == self.config.root), None)
         parts = anchors(objects, seen, self.model.num_parts) if root is None else [root]
-        found = fit_worlds(objects, labelled, seen, parts, capture.worlds == "similar", self.config.seed)
+        around = [splat.select(splat.part_ids == 0) for splat in splats]
+        found = fit_worlds(objects, labelled, seen, parts, capture.worlds == "similar", self.config.seed, around)
         if found is None:
             raise InputError(
                 f"{capture.path}: no part is seen well enough in all states to bring their worlds together; label "

@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from part_scene import NUM_PARTS, angle_deg, motion, photograph, two_states
+from part_scene import NUM_PARTS, angle_deg, box, motion, photograph, two_states
 
 from splatart_ns.geometry.se3 import transform_points
 from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_of, similarity
@@ -110,6 +110,25 @@ def test_a_world_is_doubtful_where_a_quite_other_turn_fits_hardly_worse(monkeypa
     assert next(costs, None) is None and found.doubtful == doubtful
     told = world_record("state_01", "body", found.T, found)
     assert ("quite other turn" in world_sentence(told, "state_00")) == doubtful == told["doubtful"]
+
+
+@pytest.mark.parametrize("same_room", [True, False])
+def test_surroundings_tell_which_of_turns_that_fit_alike_is_right(monkeypatch, same_room):
+    splats, views, T = apart(1.6)
+    seen = [visibility(s, v) for s, v in zip(splats, views, strict=True)]
+    turned_over(monkeypatch)
+    costs, refine = iter([1.0, 1.04]), world.refine  # the wrong one fits better
+
+    def refined(pair, T, steps, **options):
+        end = refine(pair, T, steps, **options)
+        return replace(end, cost=next(costs)) if steps == world.FEW else end
+
+    monkeypatch.setattr(world, "refine", refined)
+    room = Splat.cat([box(0, (1.6, 1.2, 0.1), (0.3, 0.2, -0.6)), box(0, (0.2, 0.2, 0.8), (0.9, 0.6, 0.0))])
+    elsewhere = moved_splat(room if same_room else room.transformed(motion((0, 0, 0), (9, 9, 9))), T)
+    found = fit_world(splats, views, seen, 1, with_scale=True, around=(room, elsewhere))
+    right = angle_deg(rigid_of(found.T), rigid_of(inverse_similarity(T))) < 5
+    assert right == same_room and found.doubtful != same_room
 
 
 def test_haze_at_one_edge_makes_no_world_larger(monkeypatch):
