@@ -10,7 +10,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from splatart_ns.geometry.se3 import matrix_from_quat
-from splatart_ns.geometry.spherical_harmonics import SH_C0
 from splatart_ns.splats.splat import Splat
 
 TOLD = 0.05
@@ -78,7 +77,7 @@ def _weights(splat: Splat, states: Tensor | None) -> csr_matrix:
     alike = np.abs((normals[i] * normals[j]).sum(-1)).clip(1e-3)
     weight = near * alike
     if states is not None:
-        of, colours = states.numpy(force=True), (SH_C0 * splat.sh[:, 0]).numpy(force=True)
+        of, colours = states.numpy(force=True), splat.base_colours.numpy(force=True)
         weight[(of[i] != of[j]) & (np.abs(colours[i] - colours[j]).max(-1) > SAME_COLOUR)] = 0
     # Nothing is cut off from its neighbours, however far they are.
     weights = csr_matrix((weight + 1e-9, (i, j)), shape=(len(means), len(means)))
