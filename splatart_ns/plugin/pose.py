@@ -40,7 +40,7 @@ from splatart_ns.stages.render_choice import InitialMotion, initial_motion
 from splatart_ns.stages.shared_labels import share_labels
 from splatart_ns.stages.siblings import slid_alike, slide_ways
 from splatart_ns.stages.silhouette import with_rendered_labels
-from splatart_ns.stages.thinning import BUDGET, MAX_VIEWS, ROUNDS, absences, expendable
+from splatart_ns.stages.thinning import BUDGET, MAX_VIEWS, ROUNDS, Absences, absences, expendable, veils
 from splatart_ns.stages.visibility import HIDDEN, looked_at
 from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_views, world_record, world_sentence
 
@@ -448,37 +448,43 @@ class PosePipeline(VanillaPipeline):
 
     @torch.no_grad()
     def _thin(self, turn: int, optimizers: Optimizers) -> None:
-        """One of the rounds in which merged Gaussians go that the images hardly miss."""
+        """One of the rounds in which merged Gaussians go that the images hardly miss, and veils."""
         start, model = time.perf_counter(), self.model
-        absence, error = self._absence(turn)
+        found = self._absences(turn)
         if turn == 0:
-            self._error = error
-            self.findings["thinned"] = {"gaussians": [model.num_points] * 2, "added_error": 0.0, "seconds": 0.0}
+            self._error = found.error
+            self.findings["thinned"] = {
+                "gaussians": [model.num_points] * 2,
+                "veils": 0,
+                "added_error": 0.0,
+                "seconds": 0.0,
+            }
         told = self.findings["thinned"]
         budget = (turn + 1) / ROUNDS * BUDGET - told["added_error"]
-        goes = expendable(absence, model.splat.part_ids, budget * self._error)
+        veil = veils(found, model.splat.detach())
+        missed = found.images.masked_fill(veil, 0.0)  # what shows behind them learns to be what it is
+        goes = expendable(missed, model.splat.part_ids, budget * self._error)
         remove(model.gauss_params, {name: optimizers.optimizers[name] for name in model.gauss_params}, {}, goes)
         model.state_ids = model.state_ids[~goes]
         told["gaussians"][1] = model.num_points
-        told["added_error"] += float(absence[goes].sum()) / self._error
+        told["veils"] += int((veil & goes).sum())
+        told["added_error"] += float(missed[goes].sum()) / self._error
         told["seconds"] = round(told["seconds"] + time.perf_counter() - start, 2)
 
-    def _absence(self, turn: int) -> tuple[Tensor, float]:
+    def _absences(self, turn: int) -> Absences:
         """What `absences` finds in some views of all states, others in each turn."""
         model = self.model
         splat, T = model.splat.detach(), model.poses.T()
         ids, known = splat.part_ids, model.covariance.isfinite().flatten(2).all(-1)
         views = [(s, view) for s, views in enumerate(self.views) for view in views]
         every = -(-len(views) // MAX_VIEWS)
-        absence, error = torch.zeros(len(splat), device=model.device), 0.0
+        found = Absences.none(splat)
         for s in range(model.num_states):
             chosen = [view for of, view in views[turn % every :: every] if of == s]
             shown = torch.cat([known.new_ones(1), known[s]])[ids]
             moved = splat.select(shown).transformed(torch.cat([torch.eye(4).to(T)[None], T[s]])[ids[shown]])
-            missed, had = absences(moved, chosen, self.config.seed + turn)
-            absence[shown] += missed
-            error += had
-        return absence, error
+            found = found.plus(absences(moved, chosen, self.config.seed + turn), shown)
+        return found
 
     def _tell_errors(self) -> None:
         """How well the images of each state are shown in the end."""

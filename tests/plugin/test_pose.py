@@ -259,6 +259,7 @@ def test_merged_gaussians_that_the_images_hardly_miss_go_and_the_report_tells(po
     assert after == model.num_points == len(model.state_ids)
     assert (1 - LARGEST_SHARE) ** ROUNDS * before <= after < 0.95 * before
     assert 0 < told["added_error"] <= BUDGET and told["seconds"] > 0
+    assert 0 <= told["veils"] <= before - after
     assert set(model.splat.part_ids.tolist()) == {1, 2}
     for name, parameter in model.gauss_params.items():
         (trained,) = trainer.optimizers.optimizers[name].param_groups[0]["params"]
@@ -313,9 +314,9 @@ def test_well_known_poses_of_parts_set_free_from_others_learn_with_merged_gaussi
 def test_what_a_state_does_not_show_is_not_missed_there(pose_trainer):
     pipeline = pose_trainer(init="centroids").pipeline
     model = pipeline.model
-    whole, _ = pipeline._absence(0)
+    whole = pipeline._absences(0).images
     model.covariance[1, 1] = torch.nan
-    absence, _ = pipeline._absence(0)
+    absence = pipeline._absences(0).images
     lid = model.splat.part_ids == 2
     assert absence[lid].sum() < whole[lid].sum() and absence[lid].any()
 
