@@ -101,13 +101,13 @@ def _absences(splat: Splat, view: View, seed: int) -> Absences:
     return Absences(images.square(), depth.square(), weight.square(), float(off.detach().square().sum()))
 
 
-def veils(absences: Absences, splat: Splat) -> Tensor:
+def veils(missed: Absences, splat: Splat) -> Tensor:
     """Which Gaussians [N] hang well before what shows without them, which looks like them: in a hollow's mouth, where
     the images do not mind them."""
     if len(splat) == 0:
         return torch.zeros_like(splat.opacities, dtype=torch.bool)
     radius = (splat.means - splat.means.mean(0)).norm(dim=-1).max()
-    before, unlike = ((of / absences.weight.clamp_min(1e-12)).sqrt() for of in (absences.depth, absences.images))
+    before, unlike = ((of / missed.weight.clamp_min(1e-12)).sqrt() for of in (missed.depth, missed.images))
     return (before > VEIL_BEFORE * radius) & (unlike < VEIL_LIKE) & (splat.opacities < VEIL_OPACITY)
 
 

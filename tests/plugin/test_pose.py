@@ -259,11 +259,25 @@ def test_merged_gaussians_that_the_images_hardly_miss_go_and_the_report_tells(po
     assert after == model.num_points == len(model.state_ids)
     assert (1 - LARGEST_SHARE) ** ROUNDS * before <= after < 0.95 * before
     assert 0 < told["added_error"] <= BUDGET and told["seconds"] > 0
-    assert 0 <= told["veils"] <= before - after
     assert set(model.splat.part_ids.tolist()) == {1, 2}
     for name, parameter in model.gauss_params.items():
         (trained,) = trainer.optimizers.optimizers[name].param_groups[0]["params"]
         assert trained is parameter and len(parameter) == after
+
+
+def test_veils_go_first_and_take_nothing_of_the_budget(pose_trainer, monkeypatch):
+    trainer = pose_trainer(init="centroids")
+    pipeline, few = trainer.pipeline, 20
+    found = pipeline._absences(0)
+    missed_most = torch.zeros_like(found.images, dtype=torch.bool)
+    missed_most[found.images.argsort()[-few:]] = True
+    monkeypatch.setattr("splatart_ns.plugin.pose.veils", lambda *_: missed_most)
+    kept = pipeline.model.means.detach()[~missed_most]
+    pipeline._thin(0, trainer.optimizers)
+    told = pipeline.findings["thinned"]
+    assert told["veils"] == few and 0 < told["added_error"] <= BUDGET / ROUNDS
+    left = {tuple(x) for x in pipeline.model.means.tolist()}
+    assert left < {tuple(x) for x in kept.tolist()}
 
 
 @pytest.mark.parametrize(
