@@ -12,6 +12,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from torch import Tensor
 
 from splatart_ns.capture.capture import UNLABELLED, Capture, State
 from splatart_ns.capture.hull import POSES_MEND, carve, contradiction, silhouette
@@ -20,6 +21,7 @@ from splatart_ns.capture.view import View, Window, load_points, load_view, load_
 from splatart_ns.errors import InputError
 from splatart_ns.machine import num_cores
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
+from splatart_ns.stages.exposure import at_gain
 from splatart_ns.stages.hull import EXACT, SeedPoints, seed_points, seen_surface, slack, visual_hull
 from splatart_ns.stages.silhouette import with_silhouette
 from splatart_ns.stages.surroundings import surrounding_points
@@ -112,6 +114,8 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         """By how much the silhouettes contradict each other."""
         self.found = SeenSurface.nothing()
         """Of the object's surface, by the frames' depth or stereo, where its silhouettes are known."""
+        self.gains: Tensor | None = None
+        """How many times brighter than their mean the training frames are, by channel [N, 3]: they come evened."""
         self.voxel = 0.0
         """Side of a voxel of the silhouettes' hull."""
         if config.seed_gaussians > 0 and test_mode == "val":  # otherwise a checkpoint brings the Gaussians
@@ -143,7 +147,9 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
             outlined = [v for view in views if (v := with_silhouette(view)) is not None]
             around = surrounding_points(views, count, generator) if points is None else points.drawn(count, generator)
             hull = visual_hull(outlined) if outlined else None
-            if hull is not None:
+            if hull is None:
+                self._require_agreement(state)
+            else:
                 points = seed_points(outlined, num_parts, count, generator, hull, seen_surface(outlined, *hull))
                 self.train_dataset.metadata["points3D_inside"] = len(points.xyz)
                 points = points.joined(around)
@@ -189,6 +195,10 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         for name in ("image", "semantics", "mask"):
             if name in data:
                 data[name] = data[name][top:bottom, left:right]
+        if self.gains is not None:
+            image = data["image"]
+            evened = at_gain(image[..., :3], self.gains[data["image_idx"]])
+            data["image"] = torch.cat([evened, image[..., 3:]], -1)
         return camera, data
 
     @cached_property

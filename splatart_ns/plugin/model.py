@@ -44,7 +44,7 @@ class SplatartModelConfig(SplatfactoModelConfig):
     """For the whole process; auto: what was chosen before, else gsplat on CUDA, numba where installed, torch."""
 
 
-_READ = {"background_color", "camera_optimizer", "rasterize_mode", "sh_degree_interval"}
+_READ = {"background_color", "camera_optimizer", "rasterize_mode"}
 """The options of Splatfacto that say how a splat is shown, or are refused by all models."""
 
 
@@ -85,6 +85,8 @@ class SplatartModel(SplatfactoModel):
             )
         if not 0 <= (degree := self.config.sh_degree) <= 3:
             raise InputError(f"--pipeline.model.sh-degree is {degree}; give 0 to 3.")
+        if self.config.num_random < 1:
+            raise InputError(f"--pipeline.model.num-random is {self.config.num_random}; give 1 or more.")
         if self.config.rasterizer != "auto":
             set_backend(self.config.rasterizer)
             if self.config.rasterizer == "numba" and torch.device(self.kwargs.get("device", "cpu")).type != "cpu":
@@ -123,6 +125,11 @@ class SplatartModel(SplatfactoModel):
             part_logits=p["semantics"],
         )
 
+    @property
+    def shown_degree(self) -> int | None:
+        """The highest degree of spherical harmonics that is rendered; None: all there are."""
+        return None
+
     def get_gaussian_param_groups(self) -> dict[str, list[nn.Parameter]]:
         return {name: [parameter] for name, parameter in self.gauss_params.items()}
 
@@ -145,7 +152,7 @@ class SplatartModel(SplatfactoModel):
             height,
             features=splat.part_probabilities if parts else None,
             with_depth=depth,
-            sh_degree=self.step // self.config.sh_degree_interval,
+            sh_degree=self.shown_degree,
             rasterize_mode=self.config.rasterize_mode,
             absgrad=self.config.use_absgrad and self.training,
         )
@@ -188,7 +195,7 @@ class SplatartModel(SplatfactoModel):
         return {"psnr": -10 * mse.clamp_min(1e-10).log10(), "gaussian_count": self.num_points}
 
     def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR, SSIM, LPIPS (when asked for) and part IoU of one evaluation image, and pictures to look at.
+        """PSNR, SSIM and LPIPS (when asked for) of one evaluation image, all its pixels, and pictures to look at.
 
         The object alone is compared with opaque images within its rendered silhouette, and `rendered_silhouette` is 1.
         """

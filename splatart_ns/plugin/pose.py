@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from splatart_ns.bundle.motion_file import read_motions
 from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.view import View
+from splatart_ns.choices import require_seed
 from splatart_ns.errors import InputError
 from splatart_ns.plugin.gaussians import gauss_params_from_splat
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig, refuse_unread
@@ -44,8 +45,8 @@ from splatart_ns.stages.thinning import BUDGET, MAX_VIEWS, ROUNDS, Absences, abs
 from splatart_ns.stages.visibility import HIDDEN, looked_at
 from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_views, world_record, world_sentence
 
-THINNING_STEPS = 25
-"""A round of thinning comes after every so many-th part of the steps on merged Gaussians."""
+THINNING_PARTS = 25
+"""Into so many parts the steps on merged Gaussians fall; each of the first few begins with a round of thinning."""
 BESIDE, SET_FREE = 0.5, 0.1
 """Poses of parts learn along with merged Gaussians if one state shows more than the first share of their border against
 others, and the other less of it by the second. 16 doors and drawers had 0.12 to 0.38 less, 80 of 93 links of robots
@@ -185,6 +186,9 @@ class PosePipeline(VanillaPipeline):
                 f"{', '.join(capture.parts.values())}, or leave it out."
             )
         refuse_unread(self.model.config, "splatart-pose")
+        require_seed(config.seed, "--pipeline.seed")
+        if self.model.config.pose_steps < 0:
+            raise InputError(f"--pipeline.model.pose-steps is {self.model.config.pose_steps}; give 0 or more.")
         runs = config.semantic_runs or find_semantic_runs(config.runs_dir, capture.path, len(capture.states))
         if len(runs) != len(capture.states):
             raise InputError(
@@ -257,7 +261,7 @@ class PosePipeline(VanillaPipeline):
                     found.setdefault((first, s), {})[p + 1] = initial_motion(*pair, p + 1, self.config.seed)
         moves = {part for motions in found.values() for part, m in motions.items() if m.found and not m.still}
         for (first, s), motions in found.items():
-            ways = slide_ways(list(motions.values()))
+            ways = slide_ways(splats[first], motions)
             pair = [(everything[first], everything[s]) for everything in (splats, self.views)]
             slid = {part: slid_alike(*pair, part, m, ways) if m.alike else m for part, m in motions.items()}
             for part, motion in turned_as_neighbours_let(*pair, slid).items():
@@ -361,7 +365,7 @@ class PosePipeline(VanillaPipeline):
             if step == self.model.config.pose_steps:
                 self._merge(optimizers)
 
-        apart = max(1, (steps - self.model.config.pose_steps) // THINNING_STEPS)
+        apart = max(1, (steps - self.model.config.pose_steps) // THINNING_PARTS)
 
         def thin(step: int) -> None:
             turn, rest = divmod(step - self.model.config.pose_steps, apart)

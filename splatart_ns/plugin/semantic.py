@@ -138,6 +138,10 @@ class SemanticModel(SplatartModel):
         """Whether the second phase has begun."""
         return self.step >= self.config.semantic_start
 
+    @property
+    def shown_degree(self) -> int:
+        return self.step // self.config.sh_degree_interval
+
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
         if self.training and self.learns_parts:
             splat = self.splat
@@ -370,13 +374,14 @@ class SemanticPipeline(VanillaPipeline):
         due = [at for at in EVENED if step == round(at * model.config.semantic_start)]
         if not due or step < LEAST_STEPS:
             return
-        found = frame_gains(model.splat.detach(), self._views, model.step // model.config.sh_degree_interval)
-        uneven = unevenness(model.gains * found, self._views)
+        # As they were taken: of an evened image nothing tells where it was cut off.
+        taken = [view.rgb for view in self.datamanager.train_dataset.views]
+        views = [replace(view, rgb=rgb) for view, rgb in zip(self._views, taken, strict=True)]
+        found = frame_gains(model.splat.detach(), views, model.shown_degree)
+        uneven = unevenness(found, views)
         if uneven > UNEVEN:
-            model.gains = model.gains * found
-            self._views = [replace(v, rgb=at_gain(v.rgb, gain)) for v, gain in zip(self._views, found, strict=True)]
-            for data in self.datamanager.cached_train:
-                data["image"][..., :3] = at_gain(data["image"][..., :3], found[data["image_idx"]])
+            model.gains = self.datamanager.gains = found
+            self._views = [replace(v, rgb=at_gain(v.rgb, gain)) for v, gain in zip(views, found, strict=True)]
         if due[-1] == EVENED[-1] and uneven > UNEVEN:
             self.findings["exposure"] = {"log_deviation": uneven}
             self.notes.append(

@@ -21,12 +21,12 @@ _HALVES = torch.float16, torch.bfloat16
 class Arguments:
     """Of N Gaussians at `means` [N, 3] before C cameras `viewmats` [C, 4, 4], which say what shapes the others have.
 
-    Everything raises ValueError for a tensor of another shape, on another device or of half precision, and TypeError
-    for what is no tensor. It takes microseconds.
+    Everything raises ValueError for a tensor of another shape or type, on another device or of half precision, and
+    TypeError for what is no tensor. It takes microseconds.
     """
 
     def __init__(self, means: Tensor, viewmats: Tensor) -> None:
-        self._device = getattr(means, "device", None)
+        self._device, self._dtype = getattr(means, "device", None), getattr(means, "dtype", None)
         self._sizes: dict[int | str, int] = {}
         for name, tensor, size, rest in (("means", means, "N", (3,)), ("viewmats", viewmats, "C", (4, 4))):
             self._require_tensor(name, tensor)
@@ -68,6 +68,8 @@ class Arguments:
             raise ValueError(f"rasterization: {name} is on {tensor.device} but means on {self._device}; bring it there")
         if tensor.dtype in _HALVES:
             raise ValueError(f"rasterization: {name} is {tensor.dtype}; give float32")
+        if tensor.dtype != self._dtype:
+            raise ValueError(f"rasterization: {name} is {tensor.dtype} but means {self._dtype}; convert either")
 
     def _wrong(self, name: str, tensor: Tensor, *shapes: Shape) -> ValueError:
         wanted = " or ".join(f"[{', '.join(map(str, shape))}]" for shape in shapes)

@@ -290,6 +290,8 @@ def _resolve(backend: Rasterizer, means: Tensor) -> Rasterizer:
         raise ValueError(f"unknown rasterization backend {backend!r}: use {', '.join(get_args(Rasterizer))}")
     if backend == "numba" and (means.dtype, means.device.type) != (torch.float32, "cpu"):
         raise ValueError(f"the numba backend takes float32 on the CPU, not {means.dtype} on {means.device}: use torch")
+    if backend == "gsplat" and (means.dtype, means.device.type) != (torch.float32, "cuda"):
+        raise ValueError(f"the gsplat backend takes float32 on CUDA, not {means.dtype} on {means.device}: use torch")
     return backend
 
 

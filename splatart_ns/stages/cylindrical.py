@@ -14,9 +14,9 @@ from typing import Any
 from torch import Tensor
 
 from splatart_ns.stages.contact import find_contacts
-from splatart_ns.stages.joint import types_for
 from splatart_ns.stages.joint_fit import JointFit
 from splatart_ns.stages.joint_pairs import fit_pairs
+from splatart_ns.stages.unseen import states_shown
 
 _WITHIN = 0.1
 """How far apart the two parts may be, and how far the line may pass by them, as a share of the object's radius. A
@@ -35,11 +35,11 @@ def turning_slides(
     """Cylindrical joints by (parent, child) of parts that are not in `hung` on those that are.
 
     `points` [N, 3] and `motions` [S, 4, 4] by part; `joints`: those of all pairs that may be joined, with what speaks
-    against simpler ones; `known` as in `find_contacts`, `settings` as in `fit_pairs`. None where there are more than
-    two states.
+    against simpler ones; `known` as in `find_contacts`, `settings` as in `fit_pairs`. None between parts that more than
+    two states show.
     """
-    pairs = [(a, b) for a, b in joints if a in hung and b not in hung]
-    if not pairs or "cylindrical" in types_for(len(motions[pairs[0][0]])):
+    pairs = [(a, b) for a, b in joints if a in hung and b not in hung and states_shown(known, (a, b)) == 2]
+    if not pairs:
         return {}
     fits = fit_pairs(points, motions, object_radius, types=["cylindrical"], **settings)
     contacts = find_contacts(points, motions, {(min(pair), max(pair)) for pair in pairs}, known)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.view import View
+from splatart_ns.errors import InputError
 from splatart_ns.rasterize.render import Rendering, render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.semantic import part_image
@@ -31,9 +32,14 @@ class ImageError:
 
 
 def image_error(splat: Splat, views: Sequence[View]) -> ImageError:
-    """How a splat shows some of `views`, which have alphas; what their masks leave out does not count, nor do views of
-    which they leave nothing, but not all are."""
+    """How a splat shows some of `views`, which have alphas. What their masks leave out does not count.
+
+    Raises:
+        InputError: The masks leave nothing of any view.
+    """
     views = [view for view in views if view.mask is None or view.mask.any()]
+    if not views:
+        raise InputError("the masks leave no pixel of any training image of a state: larger images or other masks do")
     chosen = [views[len(views) * k // MAX_VIEWS] for k in range(MAX_VIEWS)] if len(views) > MAX_VIEWS else views
     psnr, by_part = (torch.stack(of) for of in zip(*side_by_side(lambda v: _error(splat, v), chosen), strict=True))
     by_part = by_part.sum(0) / max(sum(float(view.alpha.float().sum()) / 255 for view in chosen), 1.0)

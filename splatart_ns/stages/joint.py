@@ -28,6 +28,7 @@ from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, inverse
 from splatart_ns.stages.joint_fit import UNSEEN_ROTATION, JointFit
 from splatart_ns.stages.joint_parameters import JOINT_DOFS
 from splatart_ns.stages.joint_solver import best_joints
+from splatart_ns.stages.unseen import unknown_covariance
 
 NOISE = 0.003
 """Default registration error of a part's surface, as a share of the object's bounding radius."""
@@ -83,8 +84,8 @@ def fit_joint(
     Types that leave more than `epsilon` x `object_radius`, and more than the noise explains, are not accepted.
     `render_ratio`: rendering cost with the rotation held over the cost of the free fit; where given, it alone chooses
     between turning and sliding. A covariance that is not finite says that the motion is unknown. `types`: those to
-    choose from, by default all that have fewer parameters than the motions have numbers: fixed, prismatic and revolute
-    for two states, also screw, cylindrical and spherical for more. For "free" joints there is `free_joint`.
+    choose from, by default all that have fewer parameters than the known motions have numbers: fixed, prismatic and
+    revolute for two states, also screw, cylindrical and spherical for more. For "free" joints there is `free_joint`.
     """
     if object_radius is None:
         object_radius = float(torch.linalg.vector_norm(points - points.mean(0), dim=-1).max())
@@ -109,16 +110,17 @@ def fit_joints(
         raise ValueError(f"a joint needs the motions of at least two states, not {T_rel.shape[1]}")
     # About the child's centroid translation and rotation are nearly independent, and numbers stay small.
     centroids = torch.stack([x.mean(0) for x in points])
-    types = types or types_for(T_rel.shape[1])
     about = from_rotation_translation(torch.eye(3).to(T_rel), centroids)[:, None]
     T = (inverse(about) @ T_rel @ about)[:, 1:]
     floor = [surface_noise(x, noise, object_radius) for x in points]
     errors = torch.stack(floor)[:, None].expand(*T.shape[:2], 6, 6)
+    shown = [T_rel.shape[1]] * len(points)
     if covariances is not None:
         to_body = adjoint(inverse(T_rel @ about)[:, 1:])
         known = to_body @ covariances.to(T_rel)[:, 1:] @ to_body.mT
-        unknown = torch.diag(torch.tensor([10 * object_radius] * 3 + [10.0] * 3).to(T)) ** 2
-        errors = errors + torch.where(known.isfinite().all(-1).all(-1)[..., None, None], known, unknown)
+        told = known.isfinite().all(-1).all(-1)
+        errors = errors + torch.where(told[..., None, None], known, unknown_covariance(object_radius).to(T))
+        shown = (1 + told.sum(-1)).clamp_min(2).tolist()
     whiten = torch.linalg.inv(torch.linalg.cholesky(errors))
     variances, directions = torch.linalg.eigh(errors[..., 3:, 3:])
     worst_rotation = variances.amax((-2, -1)).sqrt()
@@ -128,12 +130,14 @@ def fit_joints(
 
     # The residual is a mean; it needs no more points than these.
     sampled = [(x - c)[:: math.ceil(len(x) / _MAX_POINTS)] for x, c in zip(points, centroids, strict=True)]
-    fits = zip(*(best_joints(kind, T, whiten, unseen, sampled) for kind in types), strict=True)
+    tried = types or types_for(max(shown, default=2))
+    fits = zip(*(best_joints(kind, T, whiten, unseen, sampled) for kind in tried), strict=True)
     ratios = render_ratios or [None] * len(points)
-    return [
-        _choose([_scored(replace(f, origin=f.origin + c)) for f in pair], ratio, float(sigma), object_radius, epsilon)
-        for pair, c, ratio, sigma in zip(fits, centroids, ratios, worst_rotation, strict=True)
-    ]
+    chosen = []
+    for pair, c, n, ratio, sigma in zip(fits, centroids, shown, ratios, worst_rotation, strict=True):
+        pair = [_scored(replace(f, origin=f.origin + c, shown=n)) for f in pair if types or f.type in types_for(n)]
+        chosen.append(_choose(pair, ratio, float(sigma), object_radius, epsilon))
+    return chosen
 
 
 def types_for(states: int) -> list[str]:
@@ -147,15 +151,14 @@ def _freedom(kind: str, states: int) -> int:
 
 
 def _scored(fit: JointFit) -> JointFit:
-    states = len(fit.values)
-    parameters = 6 * (states - 1) - _freedom(fit.type, states)
+    parameters = 6 * (fit.num_shown - 1) - _freedom(fit.type, fit.num_shown)
     return replace(fit, score=fit.chi2 + _PENALTY * parameters + _RARE.get(fit.type, 0.0))
 
 
 def _choose(
     fits: list[JointFit], render_ratio: float | None, rotation_sigma: float, object_radius: float, epsilon: float
 ) -> JointFit:
-    states = len(fits[0].values)
+    states = fits[0].num_shown
     # Two states leave too few numbers to tell by how much the noise was underestimated.
     left = {f.type: f.chi2 / _freedom(f.type, states) for f in fits if states > 2 and _freedom(f.type, states) > 0}
     excess = max(1.0, min(left.values(), default=1.0))
@@ -192,8 +195,7 @@ def leaves_unexplained(fit: JointFit) -> bool:
 
     It may be two joints in a row, or one of the two parts was posed wrongly.
     """
-    states = len(fit.values)
-    return _freedom(fit.type, states) > 0 and fit.chi2 > _explained(fit.type, states)
+    return _freedom(fit.type, fit.num_shown) > 0 and fit.chi2 > _explained(fit.type, fit.num_shown)
 
 
 def _explained(kind: str, states: int) -> float:

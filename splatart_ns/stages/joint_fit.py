@@ -41,6 +41,8 @@ class JointFit:
     """Whether the residual is within the limit, or no more than the noise explains."""
     converged: bool = True
     iterations: int = 0
+    shown: int | None = None
+    """In how many states both parts are seen; None: in all."""
     covariance: dict[str, list] = field(default_factory=dict)
     """Blocks of what applies: "axis", "origin" (across the axis), "axis_origin", all [3, 3], and "values" [S, S], or
     [S D, S D] with the D values of a state side by side."""
@@ -56,14 +58,24 @@ class JointFit:
         return JOINT_DOFS[self.type]
 
     @property
+    def num_shown(self) -> int:
+        """In how many states both parts are seen."""
+        return len(self.values) if self.shown is None else self.shown
+
+    @property
     def limits(self) -> tuple[float, float] | None:
-        """The observed range of the value, a whole turn where nothing tells it; None for more than one freedom."""
+        """The observed range of the value, a whole turn where no state but the first tells it; None for more than one
+        freedom."""
         if self.dofs > 1:
             return None
-        sigma = max((row[k] for k, row in enumerate(self.covariance.get("values", []))), default=0.0) ** 0.5
-        if self.type == "revolute" and sigma > UNSEEN_ROTATION:
-            return -math.pi, math.pi
-        return float(self.values.min()), float(self.values.max())
+        values = self.values
+        if self.type == "revolute" and "values" in self.covariance:
+            variances = torch.tensor(self.covariance["values"], dtype=torch.float64).diagonal()
+            told = (variances <= UNSEEN_ROTATION**2).to(values.device)
+            if not told[1:].any():
+                return -math.pi, math.pi
+            values = values[told]
+        return float(values.min()), float(values.max())
 
     def motion(self, values: Tensor) -> Tensor:
         """Motions [..., 4, 4] of the child relative to its parent at values [...], or [..., D] for D > 1 freedoms."""
@@ -84,7 +96,10 @@ class JointFit:
         along = float(self.axis @ (centroid - self.origin))
         covariance = dict(self.covariance)
         if "origin" in covariance:
-            C_a, C_o, C_ao = (torch.tensor(covariance[k]).to(self.axis) for k in ("axis", "origin", "axis_origin"))
+            C_a, C_o, C_ao = (
+                torch.tensor(covariance[k], dtype=torch.float64).to(self.axis)
+                for k in ("axis", "origin", "axis_origin")
+            )
             across = torch.eye(3).to(self.axis) - torch.outer(self.axis, self.axis)
             slid = C_o + along * (C_ao + C_ao.mT) + along**2 * C_a
             covariance["origin"] = (across @ slid @ across).tolist()

@@ -14,7 +14,7 @@ from splatart_ns.stages.joint import EPSILON, NOISE, fit_joints, surface_noise, 
 from splatart_ns.stages.joint_constraint import JointConstraint
 from splatart_ns.stages.joint_descent import descend_joint
 from splatart_ns.stages.joint_fit import JointFit, free_joint
-from splatart_ns.stages.unseen import known_states, may_have_turned, relative_motion
+from splatart_ns.stages.unseen import known_states, may_have_turned, relative_motion, states_shown
 
 
 def fit_pairs(
@@ -72,23 +72,27 @@ def told_pair(
     excluded: Collection[str] = (),
     **settings: Any,
 ) -> dict[tuple[int, int], JointFit]:
-    """The joints, both ways round, of a pair of parts as the user wants them, accepted or not.
+    """The joints, both ways round, of a pair of parts as the user wants them, accepted or not; none where the types
+    that are ruled out leave none.
 
-    `excluded`: the types that other constraints rule out; `settings` as in `fit_pairs`.
+    `excluded`: the types that the user rules out; `settings` as in `fit_pairs`.
     """
     kind, pair = constraint.type, (constraint.parent, constraint.child)
-    fits = {edge: joints[edge] for edge in (pair, pair[::-1]) if edge in joints}
+    edges = pair, pair[::-1]
+    fits = {edge: joints[edge] for edge in edges if edge in joints}
+    num_shown = states_shown(known_states(motions, settings.get("covariances")), pair)
     if constraint.forbidden:
         if kind is None or not fits:
             return {}
-        types = [t for t in types_for(len(motions[pair[0]])) if t != kind]
-        return fit_pairs(points, motions, object_radius, types=types, **settings) if fits[pair].type == kind else fits
-    if kind is None and not fits[pair].accepted:
+        if fits[pair].type not in excluded:
+            return fits
+        types = [t for t in types_for(num_shown) if t not in excluded]
+        return fit_pairs(points, motions, object_radius, types=types, **settings) if types else {}
+    if kind is None and not (fits and fits[pair].accepted):
         # Of two states a turn about a line and a slide along it explain every motion.
-        two_states = len(motions[pair[0]]) == 2
-        kind = "cylindrical" if two_states and "cylindrical" not in excluded else "free"
+        kind = "cylindrical" if num_shown == 2 and "cylindrical" not in excluded else "free"
     if kind == "free":
-        fits = {(a, b): free_joint(inverse(motions[a].double()) @ motions[b].double(), points[b]) for a, b in fits}
+        fits = {(a, b): free_joint(inverse(motions[a].double()) @ motions[b].double(), points[b]) for a, b in edges}
     elif kind is not None:
         fits = fit_pairs(points, motions, object_radius, types=[kind], **settings)
     return fits

@@ -31,6 +31,8 @@ _MAX_ITERATIONS = 100
 _HOPELESS = 1e3  # chi^2 per observed number of a fit that is not worth many digits
 _MAX_HOPELESS = 30  # nor many iterations
 _CREEP = 1e-3  # chi^2
+_PRIOR = 1e-14
+"""What is known beforehand of each parameter, as a share of what the data say of it."""
 
 
 def best_joints(kind: str, T: Tensor, whiten: Tensor, unseen: Tensor, points: list[Tensor]) -> list[JointFit]:
@@ -147,8 +149,17 @@ def normal_equations(J: Tensor, r: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def inverse_hessian(J: Tensor) -> Tensor:
     """(J^T J)^-1 [..., K, K]; a direction that the data do not see comes out large, not infinite."""
     H, _, scale = normal_equations(J, J[..., 0])
-    C = torch.linalg.inv(H + 1e-14 * torch.eye(H.shape[-1]).to(H))
+    C = torch.linalg.inv(H + _PRIOR * torch.eye(H.shape[-1]).to(H))
     return C / (scale[..., :, None] * scale[..., None, :])
+
+
+def spread_of_solution(J: Tensor, spread: Tensor) -> Tensor:
+    """The covariance [K, K] of a least-squares solution of derivatives J [R, K], from that of J^T r, `spread` [K, K].
+
+    It is large, too, in a direction that the data do not see.
+    """
+    H_inv, scale = inverse_hessian(J), normal_equations(J, J[..., 0])[2]
+    return H_inv @ (spread + _PRIOR * scale.square().diag()) @ H_inv
 
 
 def _results(

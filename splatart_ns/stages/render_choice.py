@@ -149,12 +149,12 @@ def initial_motion(
     best = ends[order[0]]
     identity_ratio = identity_cost / max(best.cost, 1e-12)
     still = identity_ratio < STILL_RATIO
-    maybe_moved = still and identity_ratio > RESTS_RATIO
     least = min(end.cost for end in ends)  # the preferred one may cost more, and says nothing of rest
     if not still and identity_cost < SHADED_RATIO * least and so3_log(best.T[:3, :3]).norm() > OTHERWISE / 2:
         even = part_pair(splats, views, part, DOUBTFUL_VIEWS, FINE_PIXELS)
         stayed, turned = replace(even, **IN_EVEN_LIGHT).cost(torch.stack([identity, best.T])).tolist()
         still = stayed < STILL_RATIO * turned
+    maybe_moved = still and identity_ratio > RESTS_RATIO
     own = own_appearance(fine)
     alike = () if still else tuple(ends[i].T for i in order if looks_alike(T, cost, order[0], i, own))
     return InitialMotion(

@@ -7,7 +7,7 @@ But drawers of one body slide along one way, and along a line a motion is found 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -36,12 +36,13 @@ SAME_WAY = 0.98
 """Ways whose directions' cosine is larger are one."""
 
 
-def slide_ways(motions: Sequence[InitialMotion]) -> Tensor:
-    """Directions [K, 3] along which parts slid whose motions are not in doubt, but for what looks alike turned over:
-    the plain fronts of a table's only two drawers do."""
+def slide_ways(splat: Splat, motions: Mapping[int, InitialMotion]) -> Tensor:
+    """Directions [K, 3] along which parts of a labelled splat slid, by id, whose motions are not in doubt, but for what
+    looks alike turned over: the plain fronts of a table's only two drawers do."""
     ways: list[Tensor] = []
-    for motion in motions:
-        turn, shift = so3_log(motion.T[:3, :3]).norm(), motion.T[:3, 3]
+    for part, motion in motions.items():
+        centroid = splat.means.detach()[splat.part_ids == part].mean(0, keepdim=True).to(motion.T)
+        turn, shift = so3_log(motion.T[:3, :3]).norm(), (transform_points(motion.T, centroid) - centroid)[0]
         if not motion.found or motion.still or turn > math.radians(SLIDE_TURN) or not shift.any():
             continue
         if any(so3_log(other[:3, :3]).norm() < TURNED_OVER for other in motion.alike):

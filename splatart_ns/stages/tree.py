@@ -33,7 +33,15 @@ from splatart_ns.stages.joint_fit import JointFit, free_joint
 from splatart_ns.stages.joint_pairs import descend_pairs, fit_pairs, stood_still, surface_error, told_pair
 from splatart_ns.stages.tree_reasons import exchange_hint, fits_far_worse, why_contradicted, why_unattached
 from splatart_ns.stages.tree_refinement import refine_tree
-from splatart_ns.stages.unseen import as_seen, known_states, leads_blindly, may_have_turned, place_unseen, unturned
+from splatart_ns.stages.unseen import (
+    as_seen,
+    known_states,
+    leads_blindly,
+    may_have_turned,
+    place_unseen,
+    unknown_covariance,
+    unturned,
+)
 from splatart_ns.stages.unseen_turn import turned_least, turned_unseen
 
 JointMethod = Literal["screw", "descent"]
@@ -148,9 +156,9 @@ def infer_tree(
         slides = turning_slides(points, motions, allowed, hung, radius, known, **certainty)
         joints |= slides
         contacts |= find_contacts(points, motions, {_pair(*edge) for edge in slides}, known)
-    groups = _free_groups(points, motions, joints, contacts, root, radius, required)
+    groups = _free_groups(points, motions, joints, contacts, root, radius, required, noise)
     contacts |= find_contacts(points, motions, {_pair(*edge) for edge in groups}, known)
-    tree = _doubted(build_tree(sorted(points), joints | groups, contacts, root, radius, required))
+    tree = _doubted(build_tree(sorted(points), joints | groups, contacts, root, radius, required, epsilon))
     reached = reached_from([(j.parent, j.child) for j in tree.joints if (j.parent, j.child) not in groups], root)
     carried = {root, *(j.child for j in tree.joints if (j.parent, j.child) not in groups)}
     apart = {pair: contacts[pair].gap for pair in far}
@@ -205,7 +213,7 @@ def _as_told(
         excluded = {d.type for d in constraints if d.forbidden and {d.parent, d.child} == set(pair)}
         told = told_pair(c, joints, pair, motions, radius, excluded, **certainty)
         if not c.forbidden:
-            if c.type is not None and fits_far_worse(told[edge], joints[edge]):
+            if c.type is not None and edge in joints and fits_far_worse(told[edge], joints[edge]):
                 contradicted[c.child] = why_contradicted(edge, told[edge], joints[edge], radius, names)
             told = {edge: replace(fit, accepted=True) for edge, fit in told.items()}
         joints = {edge: fit for edge, fit in joints.items() if set(edge) != set(pair)} | told
@@ -225,8 +233,7 @@ def _pose_errors(
     for p, x in points.items():
         told = torch.zeros(6, 6, dtype=torch.float64, device=x.device)
         if covariances is not None:
-            unknown = (10 * radius) ** 2 * torch.eye(6).to(told)
-            told = torch.where(known[p][:, None, None], covariances[p].to(told), unknown)
+            told = torch.where(known[p][:, None, None], covariances[p].to(told), unknown_covariance(radius).to(told))
         errors[p] = told + surface_error(x.double(), motions[p].double(), noise, radius)
     return errors
 
@@ -252,11 +259,12 @@ def build_tree(
     root: int,
     object_radius: float,
     required: Mapping[int, int] | None = None,
+    epsilon: float = EPSILON,
 ) -> KinematicTree:
     """The spanning tree of least total cost from `root` over the accepted joints.
 
     `joints` by (parent, child), both ways round; `contacts` of the accepted ones by (a, b), a < b; `required`: parents
-    by child that the tree must have.
+    by child that the tree must have; `epsilon` as in `fit_joint`.
     """
     required = required or {}
     graph = {}
@@ -286,7 +294,7 @@ def build_tree(
         if _pair(j.parent, j.child) not in taken and j.parent in order and order[j.parent] < order.get(j.child, -1)
     ]
     rest.sort(key=lambda j: j.cost)
-    loops = [j for j in rest if _closes_loop(tree, j, contacts[_pair(j.parent, j.child)], object_radius)]
+    loops = [j for j in rest if _closes_loop(tree, j, contacts[_pair(j.parent, j.child)], object_radius, epsilon)]
     rejected = [j for j in rest if j not in loops]
     return replace(tree, loops=loops, rejected=rejected)
 
@@ -324,6 +332,7 @@ def _free_groups(
     root: int,
     object_radius: float,
     required: Mapping[int, int],
+    noise: float = NOISE,
 ) -> dict[tuple[int, int], JointFit]:
     """Free joints by (root, base) for groups of parts that touch and are joined, but by no joint to the rest."""
     edges = [edge for edge, fit in joints.items() if fit.accepted]
@@ -335,7 +344,7 @@ def _free_groups(
         group = reached_from([(a, b) for a, b in touching if {a, b} <= left], min(left))
         left -= group
         if len(group) > 1:
-            base = choose_root({p: points[p] for p in group if p not in required}, motions, object_radius)
+            base = choose_root({p: points[p] for p in group if p not in required}, motions, object_radius, noise)
             T_rel = inverse(motions[root].double()) @ motions[base].double()
             groups[root, base] = free_joint(T_rel, points[base])
     return groups
@@ -398,7 +407,7 @@ def _leads_aside(slide: JointFit, axis: Tensor) -> float:
     return float(torch.linalg.cross(slide.axis, axis).norm() * slide.values.abs().max())
 
 
-def _closes_loop(tree: KinematicTree, joint: Joint, contact: Contact, object_radius: float) -> bool:
+def _closes_loop(tree: KinematicTree, joint: Joint, contact: Contact, object_radius: float, epsilon: float) -> bool:
     """Whether a joint outside the tree is one of the object's, and not an accident or a consequence of the tree.
 
     It must be as well supported as the tree's own joints between the two parts (in touch, axis at the contact), and
@@ -412,7 +421,7 @@ def _closes_loop(tree: KinematicTree, joint: Joint, contact: Contact, object_rad
         return False
     if joint.gap > 1.5 * max(j.gap for j in on_cycle) or joint.cost > 1.5 * max(j.cost for j in on_cycle):
         return False
-    if joint.fit.type == "prismatic" and len(joint.fit.values) == 2:
+    if joint.fit.type == "prismatic" and joint.fit.num_shown == 2:
         return False
     # Configurations in which every joint goes its own way.
     reach = tree.observed().abs().amax(0).cpu()
@@ -421,7 +430,7 @@ def _closes_loop(tree: KinematicTree, joint: Joint, contact: Contact, object_rad
     T = dict(zip(tree.part_ids, forward_kinematics(tree, q).unbind(1), strict=True))
     T_rel = torch.cat([torch.eye(4).to(q)[None], inverse(T[joint.parent]) @ T[joint.child]])
     free = fit_joint(T_rel, contact.points.cpu(), object_radius=object_radius, types=(joint.fit.type,))
-    return free.residual > EPSILON * object_radius
+    return free.residual > epsilon * object_radius
 
 
 def _path(tree: KinematicTree, part: int) -> set[int]:

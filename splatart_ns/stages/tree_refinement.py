@@ -26,7 +26,7 @@ from splatart_ns.stages.joint_parameters import (
     moved,
     values_of,
 )
-from splatart_ns.stages.joint_solver import inverse_hessian, normal_equations
+from splatart_ns.stages.joint_solver import normal_equations, spread_of_solution
 
 _MAX_ITERATIONS = 50
 
@@ -77,9 +77,9 @@ def refine_tree(
     for C, r_part, J_part in zip(chains.spread.values(), r.split(sizes), J.split(sizes), strict=True):
         spread += J_part.T @ C @ J_part
         due += float(r_part @ torch.linalg.solve(C, r_part))
-    freedom, H_inv = J.shape[0] - J.shape[1], inverse_hessian(J)
+    freedom = J.shape[0] - J.shape[1]
     inflation = max(1.0, due / freedom) if freedom > 0 else 1.0
-    covariance = inflation * (H_inv @ spread @ H_inv)
+    covariance = inflation * spread_of_solution(J, spread)
     return replace(tree, joints=chains.finished(joints, points, motions, covariance))
 
 
@@ -115,7 +115,7 @@ class _Chains:
             if j.fit.dofs > 0:
                 c = points[j.child].to(j.fit.axis).mean(0)
                 values = j.fit.values[1:].reshape(1, len(j.fit.values) - 1, j.fit.dofs)
-                start[j.child] = j.fit.axis[None], (j.fit.origin - c)[None], torch.tensor([j.fit.pitch]).to(c), values
+                start[j.child] = j.fit.axis[None], (j.fit.origin - c)[None], c.new_tensor([j.fit.pitch]), values
                 centroid[j.child] = from_rotation_translation(torch.eye(3).to(c), c)
         root_moved = bool((motions[tree.root] != torch.eye(4).to(motions[tree.root])).any())
         whiten, spread = {}, {}

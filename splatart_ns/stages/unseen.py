@@ -28,6 +28,12 @@ def known_states(motions: Mapping[int, Tensor], covariances: Mapping[int, Tensor
     return {p: covariances[p].isfinite().flatten(1).all(-1) for p in motions}
 
 
+def unknown_covariance(object_radius: float) -> Tensor:
+    """That of a motion [6, 6] of which nothing is known, (translation, rotation): finite, but wider than all that is
+    likely."""
+    return torch.diag(torch.tensor([10 * object_radius] * 3 + [10.0] * 3, dtype=torch.float64)) ** 2
+
+
 def may_have_turned(covariances: Tensor) -> Tensor:
     """Which motions [...], from their covariances [..., 6, 6], are of parts that may have turned by any angle."""
     rotation = covariances[..., 3:, 3:].double().nan_to_num()
@@ -55,6 +61,12 @@ def as_seen(covariances: Tensor) -> Tensor:
     unseen = torch.where(variances > UNSEEN_ROTATION**2, 1 / variances.clamp_min(1e-300), 0.0)
     gain = C[..., 3:] @ directions @ torch.diag_embed(unseen) @ directions.mT
     return C - gain @ C[..., 3:, :]
+
+
+def states_shown(known: Mapping[int, Tensor], pair: tuple[int, int]) -> int:
+    """In how many states two parts are compared, 2 at least, from what is `known` of each [S]."""
+    a, b = pair
+    return max(2, int((known[a] & known[b]).sum()))
 
 
 def leads_blindly(known_a: Tensor, known_b: Tensor) -> bool:

@@ -64,7 +64,8 @@ def unobstructed(splat: Splat, rendering: Rendering) -> Tensor:
     That is its opacity times the integral of exp(-x^T C x / 2), 2 pi / sqrt(|C|).
     """
     a, b, c = rendering.info["conics"][0].detach().unbind(-1)
-    drawn = rendering.info["radii"][0].reshape(len(splat), -1).amin(-1) > 0
+    radii = rendering.info["radii"][0]  # [N], or [N, 2] of newer versions of gsplat
+    drawn = (radii if radii.ndim == 1 else radii.amin(-1)) > 0
     alone = splat.opacities.detach() * 2 * math.pi / (a * c - b * b).clamp_min(1e-12).sqrt()
     return torch.where(drawn, alone, 0.0)
 

@@ -101,6 +101,10 @@ def test_other_types_and_devices_are_named():
         rasterization(**scene(Ks=torch.zeros(C, 3, 3, device="meta")))
     with pytest.raises(ValueError, match="scales is torch.float16; give float32"):
         rasterization(**scene(scales=torch.zeros(N, 3).half()))
+    with pytest.raises(ValueError, match="viewmats is torch.float64 but means torch.float32; convert either"):
+        rasterization(**scene(viewmats=torch.eye(4).double().repeat(C, 1, 1)))
+    with pytest.raises(ValueError, match="gsplat backend takes float32 on CUDA"):
+        rasterization(**scene(), backend="gsplat")
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ from hypothesis import strategies as st
 
 from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, inverse, se3_exp, se3_log
 from splatart_ns.stages.joint import fit_joint, fit_joints, surface_noise
-from splatart_ns.stages.joint_fit import free_joint
+from splatart_ns.stages.joint_fit import JointFit, free_joint
 from splatart_ns.stages.joint_parameters import joint_motion
 
 seeds = given(seed=st.integers(0, 2**31))
@@ -303,3 +304,12 @@ def test_the_result_is_plain_enough_for_json_and_one_state_is_refused():
     json.dumps([fit.type, fit.pitch, fit.residual, fit.covariance, fit.ambiguous, fit.alternatives, fit.undetermined])
     with pytest.raises(ValueError, match="two states"):
         fit_joint(T[:1], scene.points)
+
+
+def test_limits_are_of_the_states_that_tell_the_value():
+    variances = torch.diag(torch.tensor([0.0, 1e-6, 10.0]))
+    z = torch.tensor([0.0, 0.0, 1.0]).double()
+    fit = JointFit("revolute", z, 0 * z, 0.0, torch.tensor([0.0, 0.5, 2.0]).double(), residual=0.0)
+    assert fit.limits == (0, 2)
+    assert replace(fit, covariance={"values": variances.tolist()}).limits == (0, 0.5)
+    assert replace(fit, covariance={"values": (variances + 10).tolist()}).limits == (-math.pi, math.pi)

@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import pytest
@@ -385,6 +386,32 @@ def test_a_type_can_be_excluded():
     tree = infer_tree(points, motions_of(truth, q), constraints=[JointConstraint(1, 3), excluded])
     (joint,) = (j for j in tree.joints if j.child == 3)
     assert joint.parent == 1 and joint.fit.type == "cylindrical" and joint.fit.residual < 1e-3
+
+
+def hinged_lid(angle: float):
+    """A lid on a box, and its motion about the box's edge."""
+    points = {1: box((0, 0, 0), (1, 1, 0.2), 1), 2: box((0, 0, 0.15), (1, 1, 0.1), 2)}
+    truth = KinematicTree([1, 2], 1, [true_joint(1, 2, "revolute", X, (0, -0.5, 0.1))])
+    return points, motions_of(truth, torch.tensor([[0.0], [angle]]).double())
+
+
+@pytest.mark.parametrize("kinds", list(itertools.permutations(["revolute", "prismatic", "fixed"])))
+def test_types_that_are_excluded_one_by_one_are_all_excluded(kinds):
+    points, motions = hinged_lid(1.2)
+    for count in (1, 2, 3):
+        excluded = [JointConstraint(1, 2, kind, forbidden=True) for kind in kinds[:count]]
+        for told in ([], [JointConstraint(1, 2)]):
+            tree = infer_tree(points, motions, root=1, constraints=[*excluded, *told])
+            assert not {j.fit.type for j in tree.joints} & set(kinds[:count])
+            assert len(tree.joints) == 1 or not told
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic", "screw", "cylindrical"])
+def test_the_axis_of_a_joint_that_did_not_move_is_not_known_whatever_its_type(kind):
+    points, motions = hinged_lid(0.0)
+    tree = infer_tree(points, motions, root=1, constraints=[JointConstraint(1, 2, kind)])
+    axis = torch.tensor(tree.joints[0].fit.covariance["axis"], dtype=torch.float64)
+    assert float(torch.linalg.eigvalsh(axis)[-1]) > math.pi**2
 
 
 def test_a_required_joint_that_nothing_explains_is_free():

@@ -1,14 +1,18 @@
+import math
+
 import pytest
 import torch
 from part_scene import box, motion
 
 from splatart_ns.geometry.se3 import inverse, transform_points
 from splatart_ns.stages.joint_constraint import JointConstraint
+from splatart_ns.stages.joint_pairs import fit_pairs
 from splatart_ns.stages.tree import infer_tree
 from splatart_ns.stages.unseen import place_unseen, relative_motion
 
 EYE = torch.eye(4, dtype=torch.float64)
 YES = torch.ones(3, dtype=torch.bool)
+LID = (1, 1, 0.1), (0, 0, 0.55)
 HIDDEN_FIRST = torch.tensor([False, True, True])
 
 
@@ -112,6 +116,41 @@ def test_in_a_later_state_that_hides_a_part_it_moves_with_its_parent():
     R, place, said = relative_motion(a, b, YES, known)
     assert torch.equal(place, EYE) and said.tolist() == [True, True, False]
     assert torch.allclose(R[1], slide[1]) and torch.equal(R[2], EYE)
+
+
+@pytest.mark.parametrize("size", [1.0, 0.01])
+def test_a_state_that_hides_a_part_admits_no_joint_that_explains_everything_whatever_the_unit(size):
+    """The lid turned and slid, as a screw does, in the one state that shows it beside state 0; all show the rest."""
+    boxes = {1: ((1, 1, 1), (0, 0, 0)), 2: LID, 3: ((1, 1, 0.1), (0, 0, -0.55))}
+    points = {p: size * box(1, s, c).means.double() for p, (s, c) in boxes.items()}
+    T = motion((0, 0, 70), (0.0, 0.0, 0.2))
+    T[:3, 3] *= size
+    motions = {1: EYE.repeat(3, 1, 1), 2: torch.stack([EYE, T, EYE]), 3: EYE.repeat(3, 1, 1)}
+    certain = 1e-8 * torch.diag(torch.tensor([size**2] * 3 + [1.0] * 3)).double().repeat(3, 1, 1)
+    covariances = {1: 0 * certain, 2: certain.clone(), 3: 0 * certain}
+    covariances[2][2] = torch.nan
+    fit = fit_pairs(points, motions, size, covariances=covariances)[1, 2]
+    assert fit.type in ("fixed", "prismatic", "revolute") and not fit.accepted and fit.num_shown == 2
+    assert list(infer_tree(points, motions, covariances=covariances, root=1).unattached) == [2]
+
+
+@pytest.mark.parametrize("size", [1.0, 0.01])
+def test_the_value_that_no_image_shows_is_unknown_whatever_the_unit_and_the_limits_are_of_the_others(size):
+    points = {p: size * box(1, s, c).means.double() for p, (s, c) in {1: ((1, 1, 1), (0, 0, 0)), 2: LID}.items()}
+    turn = about(motion((60, 0, 0), (0, 0, 0)), (0.0, -0.5, 0.5))
+    turn[:3, 3] *= size
+    motions = {1: EYE.repeat(3, 1, 1), 2: torch.stack([EYE, turn, EYE])}
+    certain = 1e-8 * torch.diag(torch.tensor([size**2] * 3 + [1.0] * 3)).double().repeat(3, 1, 1)
+    covariances = {1: 0 * certain, 2: certain.clone()}
+    covariances[2][2] = torch.nan
+    (joint,) = infer_tree(points, motions, covariances=covariances, root=1).joints
+    sigma = torch.tensor(joint.fit.covariance["values"]).diagonal().sqrt()
+    assert joint.fit.type == "revolute" and sigma[1] < 0.01 and sigma[2] > math.pi
+    assert joint.fit.limits == pytest.approx((0, math.radians(60)), abs=0.01)
+    covariances[2][1] = torch.nan
+    told = [JointConstraint(1, 2, "revolute")]
+    (joint,) = infer_tree(points, motions, covariances=covariances, root=1, constraints=told).joints
+    assert joint.fit.limits == (-math.pi, math.pi)
 
 
 def test_motions_that_are_all_known_are_only_compared():

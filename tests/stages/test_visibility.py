@@ -19,6 +19,12 @@ def test_what_lies_behind_others_in_all_views_is_hidden_and_what_one_view_shows_
         assert share.min() >= 0 and share.max() < 1.2
 
 
+def test_of_no_gaussians_nothing_is_shown():
+    solid = box(1, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    nothing = solid.select(torch.zeros(len(solid), dtype=torch.bool))
+    assert visibility(nothing, photograph(solid)).shape == clearest(nothing, photograph(solid)).shape == (0,)
+
+
 def test_a_gaussian_alone_is_shown_as_clearly_as_can_be():
     alone = box(1, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), spacing=0.05).select(torch.tensor([5]))
     views = photograph(box(1, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)))
