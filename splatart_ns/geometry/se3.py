@@ -84,6 +84,11 @@ def from_rotation_translation(R: Tensor, t: Tensor) -> Tensor:
     return torch.cat([top, bottom], -2)
 
 
+def translation(t: Tensor) -> Tensor:
+    """Motions [..., 4, 4] that turn nothing, by t [..., 3]."""
+    return from_rotation_translation(torch.eye(3).to(t), t)
+
+
 def inverse(T: Tensor) -> Tensor:
     """Inverses of rigid motions [..., 4, 4]."""
     R_t = T[..., :3, :3].mT

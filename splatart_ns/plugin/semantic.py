@@ -31,7 +31,7 @@ from splatart_ns.stages.camera_refinement import (
     refine_cameras,
 )
 from splatart_ns.stages.exposure import at_gain, frame_gains, unevenness
-from splatart_ns.stages.hull import carve, slack
+from splatart_ns.stages.hull import inside_silhouettes, slack
 from splatart_ns.stages.semantic import (
     accumulation_loss,
     ballots,
@@ -310,7 +310,7 @@ class SemanticPipeline(VanillaPipeline):
             return
         if all(view.alpha is not None for view in self._views):
             means = self.model.means.detach().cpu()
-            outside = ~carve(self._views, means, 2 + self._slack.pixels, self._slack.views)
+            outside = ~inside_silhouettes(self._views, means, 2 + self._slack.pixels, self._slack.views)
             self.model.fade(outside if self._refines else outside | self._is_fog(means))
 
     def _is_fog(self, means: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatart_ns.geometry.se3 import adjoint, from_rotation_translation
+from splatart_ns.geometry.se3 import adjoint, translation
 from splatart_ns.stages.joint_fit import JointFit
 
 
@@ -72,7 +72,7 @@ def shifted(tree: KinematicTree, by: Tensor) -> KinematicTree:
         fit = joint.fit
         values = fit.values
         if fit.type == "free":  # tangents about the world's origin
-            values = values @ adjoint(from_rotation_translation(torch.eye(3).to(by), by)).to(values).mT
+            values = values @ adjoint(translation(by)).to(values).mT
         return replace(
             joint, fit=replace(fit, origin=fit.origin + by.to(fit.origin), values=values), other=moved(joint.other)
         )
@@ -103,7 +103,7 @@ def forward_kinematics(
     if q.shape[-1] != sum(dofs):
         raise ValueError(f"a configuration of {q.shape[-1]} values for {sum(dofs)} of the movable joints")
     root = torch.eye(4).to(q) if root_motion is None else root_motion.to(q)
-    root = root.expand(*np.broadcast_shapes(root.shape[:-2], q.shape[:-1]), 4, 4)  # see from_rotation_translation
+    root = root.expand(*np.broadcast_shapes(root.shape[:-2], q.shape[:-1]), 4, 4)  # see translation
     motions = {tree.root: root}
     values = {id(j): v for j, v in zip(movable, q.split(dofs, -1), strict=True)}
     for joint in tree.joints:

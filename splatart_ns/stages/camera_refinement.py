@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.view import View
-from splatart_ns.geometry.se3 import inverse, se3_exp, se3_log, transform_points
+from splatart_ns.geometry.se3 import inverse, se3_exp, se3_log, transform_points, translation
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import PartView, huber_cost, part_view
 from splatart_ns.stages.refinement import STEP, increment, linearized, trial_steps
@@ -120,8 +120,7 @@ def _without_drift(viewmats: Tensor, given: Tensor, centroid: Tensor) -> Tensor:
 
     Turned and shifted alike, they are turned and shifted back; nearer or farther alike, they go back along their rays.
     """
-    to_centroid = torch.eye(4).to(given)
-    to_centroid[:3, 3] = centroid
+    to_centroid = translation(centroid.to(given))
     motions = inverse(given @ to_centroid) @ viewmats @ to_centroid
     common = se3_exp(se3_log(motions).mean(0))
     viewmats = viewmats @ to_centroid @ inverse(common) @ inverse(to_centroid)

@@ -86,7 +86,7 @@ class Slack(NamedTuple):
 EXACT = Slack()
 
 
-def carve(views: Sequence[View], grid: Tensor, dilate: int, erring: int = 0) -> Tensor:
+def inside_silhouettes(views: Sequence[View], grid: Tensor, dilate: int, erring: int = 0) -> Tensor:
     """Which points [N, 3] lie inside every silhouette but `erring` ones, and are seen at all: [N] bool.
 
     Beyond an image's border see `admitted`. A view with an empty silhouette, which would leave no point at all, says
@@ -140,7 +140,7 @@ def visual_hull(views: Sequence[View], slack: Slack = EXACT) -> Hull | None:
         grid, size = voxel_grid(low, high, count)
         grid = grid.reshape(-1, 3)
         dilate = slack.pixels + max(footprint(view, share * size) for view in views)
-        grid = grid[carve(views, grid, dilate, slack.views)]
+        grid = grid[inside_silhouettes(views, grid, dilate, slack.views)]
         if len(grid) == 0:
             return None
         low, high = grid.amin(0) - size, grid.amax(0) + size

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, inverse
+from splatart_ns.geometry.se3 import adjoint, inverse, translation
 from splatart_ns.stages.joint_fit import UNSEEN_ROTATION, JointFit
 from splatart_ns.stages.joint_parameters import JOINT_DOFS
 from splatart_ns.stages.joint_solver import best_joints
@@ -110,7 +110,7 @@ def fit_joints(
         raise ValueError(f"a joint needs the motions of at least two states, not {T_rel.shape[1]}")
     # About the child's centroid translation and rotation are nearly independent, and numbers stay small.
     centroids = torch.stack([x.mean(0) for x in points])
-    about = from_rotation_translation(torch.eye(3).to(T_rel), centroids)[:, None]
+    about = translation(centroids)[:, None]
     T = (inverse(about) @ T_rel @ about)[:, 1:]
     floor = [surface_noise(x, noise, object_radius) for x in points]
     errors = torch.stack(floor)[:, None].expand(*T.shape[:2], 6, 6)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp, so3_exp, transform_points
+from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp, so3_exp, transform_points, translation
 from splatart_ns.stages.joint_fit import JointFit, mean_distance
 from splatart_ns.stages.joint_parameters import joint_motion
 
@@ -27,7 +27,7 @@ def descend_joint(
     T_rel, points = T_rel.double(), points.to(T_rel.device).double()
     centroid = points.mean(0)
     used = points[:: -(-len(points) // max_points)] - centroid
-    about = from_rotation_translation(torch.eye(3).to(T_rel), centroid)
+    about = translation(centroid)
     targets = transform_points(inverse(about) @ T_rel @ about, used)
 
     centre = torch.zeros(3).to(T_rel).requires_grad_()
@@ -45,7 +45,7 @@ def descend_joint(
             turns = so3_exp(values[:, None] * unit)
             model = from_rotation_translation(turns, centre.expand(len(values), 3)) @ se3_exp(fixed)
         else:
-            slides = from_rotation_translation(torch.eye(3).to(unit), values[:, None] * unit)
+            slides = translation(values[:, None] * unit)
             model = se3_exp(fixed) @ slides
         loss = torch.linalg.vector_norm(transform_points(model, used) - targets, dim=-1).mean()
         loss.backward()

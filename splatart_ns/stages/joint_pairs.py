@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatart_ns.geometry.se3 import adjoint, inverse, transform_points
+from splatart_ns.geometry.se3 import adjoint, inverse, transform_points, translation
 from splatart_ns.stages.joint import EPSILON, NOISE, fit_joints, surface_noise, types_for
 from splatart_ns.stages.joint_constraint import JointConstraint
 from splatart_ns.stages.joint_descent import descend_joint
@@ -131,7 +131,5 @@ def stood_still(part: int, motions: Mapping[int, Tensor], covariances: Mapping[i
 
 def surface_error(points: Tensor, T: Tensor, noise: float, object_radius: float) -> Tensor:
     """The covariances [S, 6, 6] that the noise gives a part's motions, about the world's origin."""
-    about = torch.eye(4).to(T)
-    about[:3, 3] = points.mean(0)
-    to_world = adjoint(T @ about)
+    to_world = adjoint(T @ translation(points.mean(0).to(T)))
     return to_world @ surface_noise(points, noise, object_radius) @ to_world.mT

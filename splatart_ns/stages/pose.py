@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.capture.view import View
-from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, inverse, so3_exp, transform_points
+from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, inverse, so3_exp, transform_points, translation
 from splatart_ns.rasterize.render import Rendering
 from splatart_ns.rasterize.ssim import ssim
 from splatart_ns.splats.splat import Splat
@@ -87,7 +87,7 @@ class PartPoses(nn.Module):
         free = self.free
         centroids, radii = (x.expand(len(free), *x.shape)[free] for x in (self.centroids, self.radii))
         pivot = transform_points(self.base[1:][free], centroids[:, None])[:, 0]
-        about_pivot = adjoint(from_rotation_translation(torch.eye(3).to(pivot).expand(len(pivot), 3, 3), -pivot))
+        about_pivot = adjoint(translation(-pivot))
         to_increment = torch.cat([about_pivot[:, :3] / radii[:, None, None], about_pivot[:, 3:]], 1)
         C = to_increment @ covariance[1:][free] @ to_increment.mT
         increment = torch.cat([self.translation[free], self.rotation[free]], -1)

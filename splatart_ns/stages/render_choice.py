@@ -48,6 +48,8 @@ HOPELESS = 4.0
 """These cost more than this many times the best."""
 FINE_PIXELS = 10000
 """Refining needs as many; coarse images would bias it."""
+COARSE_STEPS, FINE_STEPS = 5, 10
+"""Iterations of a refinement on few pixels, which only brings near, and on many."""
 SIMILAR = 2.5
 """Candidates that cost more than this many times the best are dropped before refining."""
 OTHERS = 2
@@ -171,7 +173,7 @@ def initial_motion(
 def searched_widely(small: PartPair, coarse: PartPair, fine: PartPair, candidates: Tensor) -> list[Refinement]:
     """What compass searches from the most hopeful of `candidates` [C, 4, 4], on few pixels, end in, refined."""
     wide = torch.stack([search(small, T) for T in choose(coarse, candidates, float("inf"), keep=5)])
-    return [refine(fine, T, 10) for T in choose(coarse, wide, 1.5)]
+    return [refine(fine, T, FINE_STEPS) for T in choose(coarse, wide, 1.5)]
 
 
 def in_doubt(
@@ -219,7 +221,7 @@ def turned_alike(tiny: PartPair, coarse: PartPair, T: Tensor) -> Tensor:
     turned = turned[1:][torch.from_numpy(cost[1:] <= HOPELESS * cost[0])]
     if len(turned) == 0:
         return turned
-    nearest = [refine(coarse, near, 5).T for near in choose(coarse, turned, float("inf"))]
+    nearest = [refine(coarse, near, COARSE_STEPS).T for near in choose(coarse, turned, float("inf"))]
     ends = torch.stack([T, *nearest])
     cost, motions = appearance_cost(coarse, ends), ends.cpu().numpy()
     own = own_appearance(coarse)
@@ -245,10 +247,10 @@ def alike_in_even_light(
     if coarse is None or fine is None:
         return []
     even, evenly = (replace(pair, **IN_EVEN_LIGHT) for pair in (coarse, fine))
-    near = [refine(even, start, 5) for start in choose(coarse, candidates, float("inf"))]
+    near = [refine(even, start, COARSE_STEPS) for start in choose(coarse, candidates, float("inf"))]
     least = min(end.cost for end in near)
-    ends = [refine(evenly, end.T, 10) for end in near if end.cost <= SIMILAR_TURN * least]
-    limit = max(ALIKE * refine(evenly, T, 10).cost, AS_WELL * evenly.own_cost())
+    ends = [refine(evenly, end.T, FINE_STEPS) for end in near if end.cost <= SIMILAR_TURN * least]
+    limit = max(ALIKE * refine(evenly, T, FINE_STEPS).cost, AS_WELL * evenly.own_cost())
     return [end.T for end in sorted(ends, key=lambda end: end.cost) if end.cost < limit]
 
 
@@ -258,12 +260,12 @@ def refined(coarse: PartPair, fine: PartPair, candidates: Tensor) -> list[Refine
     If the best turns the part over, `mere_shifts` come last, for `prefer_slide`.
     """
     if len(candidates) > 1:
-        near = [refine(coarse, T, 5) for T in candidates]
+        near = [refine(coarse, T, COARSE_STEPS) for T in candidates]
         least = min(near, key=lambda end: end.cost)
         half_turn = so3_log(least.T[:3, :3]).norm() > HALF_TURN  # to which `prefer_less_turn` may prefer dearer ones
         times = DOUBTFUL if half_turn else 1.5
         candidates = choose(coarse, torch.stack([end.T for end in near]), times, own=own_appearance(coarse))
-    ends = [refine(fine, T, 10) for T in candidates]
+    ends = [refine(fine, T, FINE_STEPS) for T in candidates]
     return [*ends, *mere_shifts(fine, ends)]
 
 

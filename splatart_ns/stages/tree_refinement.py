@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, inverse, se3_log
+from splatart_ns.geometry.se3 import adjoint, inverse, se3_log, translation
 from splatart_ns.stages.articulate import Joint, KinematicTree
 from splatart_ns.stages.joint_fit import free_joint, mean_distance
 from splatart_ns.stages.joint_parameters import (
@@ -116,7 +116,7 @@ class _Chains:
                 c = points[j.child].to(j.fit.axis).mean(0)
                 values = j.fit.values[1:].reshape(1, len(j.fit.values) - 1, j.fit.dofs)
                 start[j.child] = j.fit.axis[None], (j.fit.origin - c)[None], c.new_tensor([j.fit.pitch]), values
-                centroid[j.child] = from_rotation_translation(torch.eye(3).to(c), c)
+                centroid[j.child] = translation(c)
         root_moved = bool((motions[tree.root] != torch.eye(4).to(motions[tree.root])).any())
         whiten, spread = {}, {}
         for j in jointed:

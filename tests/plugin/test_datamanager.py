@@ -17,7 +17,7 @@ from splatart_ns.capture.view import View
 from splatart_ns.errors import InputError
 from splatart_ns.plugin.datamanager import SplatartDatamanager, SplatartDatamanagerConfig
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
-from splatart_ns.stages.hull import carve
+from splatart_ns.stages.hull import inside_silhouettes
 from splatart_ns.stages.silhouette import with_silhouette
 
 
@@ -83,7 +83,7 @@ def test_opaque_images_start_from_points_on_the_object_and_on_what_surrounds_it(
     assert manager.next_train(0)[1]["image"].shape == (32, 32, 3)
     xyz = manager.train_dataparser_outputs.metadata["points3D_xyz"]
     labelled = [with_silhouette(manager.train_dataset.get_view(i)) for i in range(len(manager.train_dataset))]
-    inside = carve(labelled, xyz, dilate=2)
+    inside = inside_silhouettes(labelled, xyz, dilate=2)
     assert inside[:-100].float().mean() > 0.95 and inside[-100:].float().mean() < 0.5
     assert inside[:-100].sum() >= 100
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerSlider
 from torch import Tensor
@@ -134,6 +135,17 @@ def test_a_checkpoint_brings_joints_and_sliders_back() -> None:
     assert loaded.joint_01.name == "body_to_drawer (metre)"
     assert torch.equal(loaded.posed_splat().means, model.posed_splat().means)
     assert loaded.tree.root == 1 and [j.fit.type for j in loaded.tree.joints] == ["revolute", "prismatic"]
+
+
+def test_a_model_shows_all_bands_of_colour_whether_it_was_just_made_or_loaded() -> None:
+    model, _, _ = started_model()
+    loaded = new_model()
+    loaded.load_state_dict(model.state_dict())
+    camera = Cameras(translation(0, 0, 3)[None, :3].float(), fx=40.0, fy=40.0, cx=16.0, cy=16.0, width=32, height=32)
+    with torch.no_grad():
+        live, again = (m.get_outputs(camera)["rgb"] for m in (model, loaded))
+        loaded.gauss_params["features_rest"].zero_()
+        assert torch.equal(live, again) and not torch.allclose(live, loaded.get_outputs(camera)["rgb"], atol=0.05)
 
 
 def test_an_object_without_joints_has_no_sliders() -> None:

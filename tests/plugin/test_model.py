@@ -63,6 +63,11 @@ def test_spherical_harmonics_of_other_degrees_are_refused(degree: int) -> None:
         SplatartModelConfig(sh_degree=degree).setup(scene_box=None, num_train_data=1, metadata={})
 
 
+def test_no_random_gaussians_at_all_are_refused() -> None:
+    with pytest.raises(InputError, match="num-random is 0; give 1 or more"):
+        SplatartModelConfig(num_random=0).setup(scene_box=None, num_train_data=1, metadata={})
+
+
 def test_metrics_that_are_not_computed_are_refused() -> None:
     with pytest.raises(InputError, match="color-corrected-metrics is True, .* leave it out"):
         SplatartModelConfig(color_corrected_metrics=True).setup(scene_box=None, num_train_data=1, metadata={})

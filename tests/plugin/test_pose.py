@@ -387,6 +387,13 @@ def test_a_part_that_only_seems_to_rest_is_not_held_where_another_state_shows_th
 def test_a_run_that_would_never_merge_is_refused(pose_trainer):
     with pytest.raises(InputError, match="max-num-iterations"):
         pose_trainer(steps=4, pose_steps=4, init="centroids")
+    with pytest.raises(InputError, match="pose-steps is -1; give 0 or more"):
+        pose_trainer(pose_steps=-1, init="centroids")
+
+
+def test_a_seed_that_is_none_is_refused(pose_trainer):
+    with pytest.raises(InputError, match="--pipeline.seed is -1"):
+        pose_trainer(seed=-1)
 
 
 def test_merged_gaussians_learn_from_the_pieces_that_show_the_object(pose_trainer):

@@ -11,7 +11,7 @@ from splatart_ns.stages.hull import (
     MIN_POINTS_PER_PART,
     POINTS_PER_PART,
     POINTS_PER_PIXEL,
-    carve,
+    inside_silhouettes,
     likely_parts,
     seed_points,
     seen_surface,
@@ -50,11 +50,8 @@ def test_a_rod_thinner_than_the_voxels_does_not_fall_between_their_centres():
 
 
 def test_what_no_view_sees_or_one_view_sees_through_is_carved():
-    assert carve(VIEWS, torch.tensor([[0.0, 0.0, -0.1], [0.0, 0.6, 0.0], [0.0, 0.0, 50.0]]), 0).tolist() == [
-        True,
-        False,
-        False,
-    ]
+    points = torch.tensor([[0.0, 0.0, -0.1], [0.0, 0.6, 0.0], [0.0, 0.0, 50.0]])
+    assert inside_silhouettes(VIEWS, points, 0).tolist() == [True, False, False]
 
 
 def test_beyond_the_border_of_a_whole_view_is_outside_and_of_a_cut_view_unknown():
@@ -63,10 +60,10 @@ def test_beyond_the_border_of_a_whole_view_is_outside_and_of_a_cut_view_unknown(
     cut = view.to("cpu")
     cut.alpha = torch.full_like(view.alpha, 255)
     centre = torch.zeros(1, 3)
-    assert not carve([view], beyond, 0).any()
-    assert carve([cut], centre, 0).all()
-    assert not carve([cut], beyond, 0).any()  # never seen at all
-    assert carve([cut, *VIEWS], torch.tensor([[0.0, 0.0, -0.1]]), 0).all()
+    assert not inside_silhouettes([view], beyond, 0).any()
+    assert inside_silhouettes([cut], centre, 0).all()
+    assert not inside_silhouettes([cut], beyond, 0).any()  # never seen at all
+    assert inside_silhouettes([cut, *VIEWS], torch.tensor([[0.0, 0.0, -0.1]]), 0).all()
 
 
 def test_points_take_the_label_that_most_views_show():
@@ -175,15 +172,15 @@ def test_of_many_views_one_that_loses_a_plate_from_its_edge_is_no_slack_of_the_c
     assert (found.pixels, found.views) == (0, 1)
     without, _ = visual_hull(lost)
     assert float(hull[0][:, 0].min()) < -0.45 < -0.3 < float(without[:, 0].min())
-    inside = carve(lost, hull[0], dilate=1, erring=1)
-    assert inside.all() and not carve(lost, hull[0], dilate=1).all()
+    inside = inside_silhouettes(lost, hull[0], dilate=1, erring=1)
+    assert inside.all() and not inside_silhouettes(lost, hull[0], dilate=1).all()
     assert slack(lost[-12:])[0].pixels > 0
 
 
 def test_where_a_view_may_err_what_is_a_quarter_covered_counts():
     faint = [replace(view, alpha=view.alpha // 4) for view in VIEWS]
     centre = torch.tensor([[0.0, 0.0, -0.1]])
-    assert carve(faint, centre, 0, erring=1).all() and not carve(faint, centre, 0).any()
+    assert inside_silhouettes(faint, centre, 0, erring=1).all() and not inside_silhouettes(faint, centre, 0).any()
 
 
 def test_views_that_may_err_do_not_hide_that_cameras_are_a_little_off():

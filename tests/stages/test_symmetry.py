@@ -5,7 +5,7 @@ import pytest
 import torch
 from part_scene import angle_deg, box, disc, inverse, motion, photograph
 
-from splatart_ns.geometry.se3 import adjoint, from_rotation_translation, se3_exp
+from splatart_ns.geometry.se3 import adjoint, se3_exp, translation
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import pose_evidence, symmetry
 from splatart_ns.stages.joint import fit_joint
@@ -162,7 +162,7 @@ def test_an_axis_may_be_as_far_astray_as_silhouettes_weigh_turns_about_it(plain)
     carried = motion((0, 0, 0), (0.5, 0, 0))
     centre = pair.centroid + carried[:3, 3]
     spread = symmetry._astray(pair, carried, about(axis, centre), torch.tensor(0.09).double())
-    to_centre = adjoint(from_rotation_translation(torch.eye(3).double(), -centre))
+    to_centre = adjoint(translation(-centre))
     spread, across = to_centre @ spread @ to_centre.mT, torch.eye(3).double() - axis.outer(axis)
     assert torch.allclose(spread[3:, 3:], 0.01 * across)
     assert torch.allclose(spread[:3, :3], 0.01 * pair.radius**2 * across)

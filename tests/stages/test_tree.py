@@ -6,7 +6,7 @@ import torch
 from tree_scene import X, Y, Z, box, edges, four_bar, motions_of, rod, true_joint
 
 from splatart_ns.errors import InputError
-from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp, so3_exp, transform_points
+from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp, so3_exp, transform_points, translation
 from splatart_ns.stages.articulate import KinematicTree, forward_kinematics
 from splatart_ns.stages.contact import find_contacts
 from splatart_ns.stages.joint import NOISE
@@ -374,7 +374,7 @@ def test_ids_that_may_be_exchanged_in_a_state_are_told_where_no_joint_explains_t
     assert not infer_tree(points, motions).unattached
     throw = se3_exp(torch.tensor([0.0, 0, 0, 0.3, 0.4, -0.5]).double())
     for part, other in ((2, 3), (3, 2)):
-        about = [from_rotation_translation(torch.eye(3).double(), points[p].mean(0)) for p in (other, part)]
+        about = [translation(points[p].mean(0)) for p in (other, part)]
         motions[part] = torch.stack([torch.eye(4).double(), about[0] @ throw @ inverse(about[1])])
     tree = infer_tree(points, motions, root=1, names={1: "body", 2: "upper", 3: "lower"})
     assert tree.unattached[2].endswith("it lies where lower was, and lower where it was: are their ids exchanged?")

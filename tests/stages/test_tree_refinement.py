@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from splatart_ns.geometry.se3 import from_rotation_translation, inverse, se3_exp
+from splatart_ns.geometry.se3 import inverse, se3_exp, translation
 from splatart_ns.stages import tree_refinement
 from splatart_ns.stages.articulate import Joint, KinematicTree, forward_kinematics
 from splatart_ns.stages.joint import fit_joint
@@ -42,7 +42,7 @@ def observe(sigmas: dict[int, torch.Tensor], seed: int, share: float = 0.0):
     for p in T:
         sigma = sigmas.get(p, torch.full((6,), 1e-9)).double()
         motions[p], C = T[p].clone(), torch.zeros(4, 6, 6, dtype=torch.float64)
-        at_rest = from_rotation_translation(torch.eye(3).double(), POINTS[p].mean(0))
+        at_rest = translation(POINTS[p].mean(0))
         first = math.sqrt(share) * sigma * torch.randn(6, generator=generator, dtype=torch.float64)
         for s in range(1, 4):
             about = torch.eye(4, dtype=torch.float64)
