@@ -52,6 +52,8 @@ def new_folder(path: Path) -> Iterator[Path]:
 
     Raises `InputError` if `path` is in use or cannot be written.
     """
+    if path.exists() and path.samefile(Path.cwd()):
+        raise InputError(f"{path}: is the folder that you are in; give another output folder.")
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(f"{path}: is there already and not empty; give another output folder, or remove it.")
     try:
@@ -81,6 +83,15 @@ def errors_about(path: Path, temporary: Path) -> Iterator[None]:
         if not named.is_relative_to(temporary):
             raise
         raise OSError(error.errno, error.strerror, str(path / named.relative_to(temporary))) from error
+
+
+def require_writable(folder: Path, mend: str) -> None:
+    """Raise `InputError` where no file can be made in a folder, before the work whose result is to go there."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror}); {mend}.") from None
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -31,7 +31,7 @@ def num_cores() -> int:
 def memory_mb() -> int:
     """Memory of this machine, or of the container that this process runs in, in MiB."""
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    limit = _told("memory.max")
+    limit = _told("memory.max") or _told("memory/memory.limit_in_bytes")  # of version 2 of cgroups, of version 1
     return (min(memory, int(limit)) if limit.isdigit() else memory) // 2**20
 
 

@@ -46,5 +46,5 @@ def parse_yaml(text: str, ignore_tags: bool = False) -> Any:
         raise ValueError("it is longer than 8 MiB")
     try:
         return yaml.load(text, Loader=_TagBlindLoader if ignore_tags else _PlainLoader)  # both are SafeLoaders
-    except (yaml.YAMLError, RecursionError) as error:
+    except (yaml.YAMLError, RecursionError, OverflowError) as error:
         raise ValueError(getattr(error, "problem", None) or str(error).partition("\n")[0]) from None

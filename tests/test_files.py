@@ -1,10 +1,12 @@
 import errno
 import json
 import math
+from pathlib import Path
 
 import pytest
 
-from splatart_ns.files import new_folder, replacing, replacing_all, write_json
+from splatart_ns.errors import InputError
+from splatart_ns.files import new_folder, replacing, replacing_all, require_writable, write_json
 
 
 def test_a_block_that_ends_well_puts_the_file_in_place(tmp_path):
@@ -40,6 +42,23 @@ def test_files_that_belong_together_change_all_or_none(tmp_path):
             file.write_text("whole")
         assert paths[0].read_text() == "good"
     assert [path.read_text() for path in paths] == ["whole", "whole"]
+
+
+@pytest.mark.parametrize("name", [".", "../here", "inner/.."])
+def test_the_folder_that_one_is_in_is_refused_before_the_work(tmp_path, monkeypatch, name):
+    (tmp_path / "here/inner").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here")
+    with pytest.raises(InputError, match="is the folder that you are in"), new_folder(Path(name)):
+        raise AssertionError
+
+
+def test_a_folder_in_which_nothing_can_be_written_is_told(tmp_path):
+    require_writable(tmp_path, "go elsewhere")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "missing", tmp_path / "file"):
+        with pytest.raises(InputError, match=f"{folder}: cannot be written .*; go elsewhere"):
+            require_writable(folder, "go elsewhere")
 
 
 @pytest.mark.parametrize("writing", [replacing, new_folder])

@@ -54,6 +54,13 @@ def test_memory_is_that_of_a_container(container):
     assert memory_mb() > 64
 
 
+def test_memory_of_a_container_by_version_1_of_cgroups(container):
+    container({"memory/memory.limit_in_bytes": f"{64 * 2**20}\n"})
+    assert memory_mb() == 64
+    container({"memory/memory.limit_in_bytes": "9223372036854771712\n"})
+    assert memory_mb() > 64
+
+
 @pytest.fixture
 def listed(tmp_path, monkeypatch):
     """Makes an nvidia-smi that prints so."""

@@ -33,8 +33,12 @@ def fit_captures(
     console: Console,
 ) -> int:
     """Fit all captures of a source, see `read_entries`; returns the exit code."""
+    from splatart_ns.bundle.export.formats import require
+
     require_seed(settings["seed"])
     require_downscale(settings["downscale"])
+    if address is None:  # other machines may have other libraries
+        require(exports)
     recipe = Fitting(rasterizer, tuple(dict.fromkeys(exports)))
     entries = read_entries(source, settings)
     check_apart(entries, open_storage(out_url))

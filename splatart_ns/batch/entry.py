@@ -159,6 +159,13 @@ def _json_rows(source: str, text: str) -> Iterable[tuple[int, dict[str, Any]]]:
         yield number, row
 
 
+def _can_be_a_path(text: str) -> bool:
+    try:
+        return b"\0" not in os.fsencode(text)
+    except UnicodeEncodeError:
+        return False
+
+
 def _entry(where: str, row: dict[str, Any], folder: str, settings: dict[str, Any]) -> Entry:
     if unknown := set(row) - {"path", "name", *_SETTINGS}:
         known = ", ".join(("path", "name", *_SETTINGS))
@@ -166,6 +173,8 @@ def _entry(where: str, row: dict[str, Any], folder: str, settings: dict[str, Any
     for key in ("path", "name", "root"):
         if key in row and not (isinstance(row[key], str) and row[key]):
             raise InputError(f"{where}: '{key}' is {row[key]!r}; give a text.")
+    if not _can_be_a_path(row.get("path", "")):
+        raise InputError(f"{where}: 'path' is {row['path']!r}; no path has such a character.")
     if "path" not in row:
         raise InputError(f"{where}: 'path' is missing; give the folder of a capture.")
     if row.get("quality", "draft") not in get_args(Quality):

@@ -175,6 +175,7 @@ def _train(work: Work, stage: str, settings: Settings) -> tuple[dict[str, Any], 
             told |= {key: done["pose"][key] for key in TRAINED_ON}
             write_json(work.folder / "report.json", told)
             kept += ["report.json", "parts", "articulation.json"]
+            work.discard("metrics.json", "export")  # which are of the bundle before
     return outcome, kept
 
 

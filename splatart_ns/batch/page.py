@@ -104,7 +104,7 @@ def _row(row: dict[str, Any], pictured: bool) -> str:
         _cell(row["name"], escape(row["name"]), "long"),
         f'<td class="pictures">{pictures}</td>',
         _cell(row["status"], f'<span class="{row["status"]}">{row["status"]}</span>'),
-        _cell(len(joints) if row["status"] == "done" else "", _joint_list(row, joints), "long"),
+        _cell(len(joints) if row["status"] == "done" else "", _joint_list(joints), "long"),
         _number(residual, ".2g", " " + row.get("length_unit", "")),
         _number(deviation, ".2g", "°"),
         _number(sum(joint["ambiguous"] for joint in joints) if row["status"] == "done" else None, "d"),
@@ -115,7 +115,7 @@ def _row(row: dict[str, Any], pictured: bool) -> str:
     return f"<tr>{''.join(cells)}</tr>\n"
 
 
-def _joint_list(row: dict[str, Any], joints: list[dict[str, Any]]) -> str:
+def _joint_list(joints: list[dict[str, Any]]) -> str:
     def told(joint: dict[str, Any]) -> str:
         text = f"{escape(joint['child'])} on {escape(joint['parent'])}: {escape(joint['type'])}"
         deviation = joint["axis_deviation"]

@@ -48,10 +48,14 @@ class LiveProgress:
         self._bar.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._show(now=True)
         self._bar.stop()
-        patiently(lambda: self.report.write(self._out))
+        if kind is None:
+            patiently(lambda: self.report.write(self._out))
+        else:
+            with suppress(*UNANSWERED):  # why the batch ended is told, not that of its report
+                self.report.write(self._out)
 
     def started(self, entry: Entry, stage: str) -> None:
         self._running[f"{entry.name}: {stage}"] += 1

@@ -120,6 +120,13 @@ class Work:
             else:
                 self.out.get(f"{self.entry.name}/{path}", self.folder / path)
 
+    def discard(self, *paths: str) -> None:
+        """Remove folders or files that earlier stages left where the bundle will be."""
+        for path in paths:
+            inside = [""] if Path(path).suffix else [f"/{name}" for name in self.out.files(f"{self.entry.name}/{path}")]
+            for name in inside:
+                self.out.remove(f"{self.entry.name}/{path}{name}")
+
     def outcome(self, stage: str) -> dict[str, Any]:
         """Of an earlier stage."""
         marker = read_marker(self.out, self.entry.name, stage)

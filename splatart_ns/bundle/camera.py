@@ -20,6 +20,8 @@ from splatart_ns.geometry.se3 import transform_points
 from splatart_ns.records import LONGEST
 
 _SAMPLES_PER_PART = 500
+SIZED_BY = 256
+"""So many configurations at most say how large the object is."""
 _MIN_OPACITY = 0.1
 FIELD_OF_VIEW = math.radians(35)
 ELEVATION = math.radians(25)
@@ -106,7 +108,8 @@ def _require_matrices(name: str, tensor: Tensor, size: int) -> None:
 
 
 def bounding_sphere(bundle: Bundle, configurations: Sequence[Mapping[str, JointValue]]) -> tuple[np.ndarray, float]:
-    """Centre [3] and radius of a sphere about the visible Gaussians in all configurations, without the outermost 0.5 %.
+    """Centre [3] and radius of a sphere about the visible Gaussians in all configurations, or an even choice of them,
+    without the outermost 0.5 %.
 
     The radius is positive even for an object of one point.
     """
@@ -116,7 +119,8 @@ def bounding_sphere(bundle: Bundle, configurations: Sequence[Mapping[str, JointV
         step = max(1, len(visible) // _SAMPLES_PER_PART)
         samples[part.name] = visible[::step]
     points = []
-    for configuration in configurations:
+    for k in np.unique(np.linspace(0, len(configurations) - 1, SIZED_BY).round().astype(int)):
+        configuration = configurations[k]
         motions = configured_motions(bundle, configuration)
         points += [transform_points(motions[name], x).reshape(-1, 3) for name, x in samples.items()]
     x = torch.cat(points).numpy()

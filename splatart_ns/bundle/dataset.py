@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from splatart_ns.bundle.articulated_splat import ArticulatedSplat, Picture
-from splatart_ns.bundle.camera import Camera, bounding_sphere, orbit_camera
+from splatart_ns.bundle.camera import SIZED_BY, Camera, bounding_sphere, orbit_camera
 from splatart_ns.bundle.configurations import Configuration
 from splatart_ns.capture.synthesis_options import MOST_PIXELS
 from splatart_ns.choices import Views
@@ -23,8 +23,8 @@ Unreasonable Effectiveness of Quasirandom Sequences, 2018)."""
 _FREE = 0.25
 """How far the values of all states may be shifted, in distances between them: the less, the further two states are
 apart."""
-_MOST_STATES, _SIZED_BY = 100_000, 256
-"""Configurations that there may be; so many of them say how large the object is."""
+_MOST_STATES = 100_000
+"""Configurations that there may be."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Dataset:
             self.options = replace(self.options, **{name: int(value)})
         if self.options.views not in get_args(Views):
             raise InputError(f"--views is {self.options.views!r}; give {' or '.join(get_args(Views))}")
-        some = [self.configuration(state) for state in range(min(self.options.states, _SIZED_BY))]
+        some = [self.configuration(state) for state in range(min(self.options.states, SIZED_BY))]
         self.centre, self.radius = bounding_sphere(splat.bundle, some)
         """Of a sphere about the object in all states, which every image shows whole."""
 

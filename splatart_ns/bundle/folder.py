@@ -96,7 +96,7 @@ def _splat_paths(bundle: Bundle) -> dict[str, str]:
     paths: dict[str, str] = {}
     for part in bundle.parts:
         stem = re.sub(r"[^A-Za-z0-9_-]+", "_", part.name) or "part"
-        if f"parts/{stem}.ply".lower() in {p.lower() for p in paths.values()}:
+        while f"parts/{stem}.ply".lower() in {p.lower() for p in paths.values()}:
             stem = f"{stem}_{part.id}"
         paths[part.name] = f"parts/{stem}.ply"
     return paths

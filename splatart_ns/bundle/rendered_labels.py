@@ -16,7 +16,7 @@ from splatart_ns.bundle.posing import moved_splat, normalized, observed_motions,
 from splatart_ns.bundle.vantage import in_canonical_world
 from splatart_ns.capture.capture import UNLABELLED, Capture, Frame, Normalization
 from splatart_ns.capture.images import read_image, read_sized, write_png
-from splatart_ns.capture.mask_export import mask_path, write_mask_classes
+from splatart_ns.capture.mask_export import mask_paths, write_mask_classes
 from splatart_ns.errors import InputError
 from splatart_ns.files import new_folder, replacing
 from splatart_ns.geometry.camera import viewmat_from_opengl
@@ -63,10 +63,11 @@ def write_labels(
     with new_folder(output) as folder:
         for k, state in enumerate(capture.states):
             splat = normalized(moved_splat(bundle, observed_motions(bundle, k)), capture.normalization).to(device)
+            paths = mask_paths(state)
             for frame in state.frames:
                 if frame.labels is not None:
                     continue
-                name = mask_path(state, frame)
+                name = paths[frame.name]
                 shares = _part_shares(splat, features, frame, capture.normalization)
                 most, place = shares.max(-1)
                 labels = torch.where(most >= _SURE, ids[place], UNLABELLED).numpy().astype(np.uint8)

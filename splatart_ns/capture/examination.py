@@ -103,7 +103,7 @@ def as_text(examination: Examination) -> str:
     rows: dict[str, list[str]] = {}
     for item in examination.coverage:
         rows.setdefault(item.part, []).append(f"{item.frames} of {item.labelled}")
-    states = list(dict.fromkeys(item.state for item in examination.coverage))
+    states = [] if examination.capture is None else [state.name for state in examination.capture.states]
     if min(examination.shown, default=1) < 1:
         rows["of what all frames show"] = [f"{share:.0%}" for share in examination.shown]
     if rows:
@@ -451,7 +451,7 @@ def _labelled_there(a: _Evidence, there: Sequence[Ballot], num_parts: int) -> Te
 
 
 def _check_motion(capture: Capture, first: _Evidence, other: _Evidence) -> Iterator[Problem]:
-    if first.votes is None or other.votes is None:
+    if not capture.parts or first.votes is None or other.votes is None:
         return
     parts = list(capture.parts)
     place, num_parts = capture.path / other.state.name, max(parts)
@@ -486,7 +486,7 @@ def _check_motion(capture: Capture, first: _Evidence, other: _Evidence) -> Itera
 
 def _check_sizes(capture: Capture, first: _Evidence, other: _Evidence) -> Iterator[Problem]:
     """A rigid part is as large in all states: where none is, lengths on the images are not what they are told to be."""
-    if first.votes is None or other.votes is None:
+    if not capture.parts or first.votes is None or other.votes is None:
         return
     times = other.part_sizes(list(capture.parts)) / first.part_sizes(list(capture.parts))
     times = times[times.isfinite()]

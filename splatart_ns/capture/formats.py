@@ -304,24 +304,27 @@ def _frame(file: Path, root: Path, name: str, meta: dict[str, Any], entry: dict[
         return None if value is None else inner_path(file, root, f"{key} of {owner}", value)
 
     image = inner_path(file, root, f"file_path of {owner}", name)
-    unit = entry.get("depth_unit_scale_factor", meta.get("depth_unit_scale_factor", Frame.depth_unit))
+    own = own_before(entry, meta)
+    unit = own.get("depth_unit_scale_factor")
     return Frame(
         name=name,
         image=image,
-        camera=parse_camera(file, owner, own_before(entry, meta), image),
+        camera=parse_camera(file, owner, own, image),
         T_world_camera=parse_pose(file, owner, entry.get("transform_matrix")),
         split=split,
         labels=optional("semantics_path"),
         object_mask=optional("object_mask_path"),
         mask=optional("mask_path"),
         depth=optional("depth_file_path"),
-        depth_unit=parse_positive(file, f"depth_unit_scale_factor of {owner}", unit),
+        depth_unit=Frame.depth_unit
+        if unit is None
+        else parse_positive(file, f"depth_unit_scale_factor of {owner}", unit),
     )
 
 
 def _splits(file: Path, meta: dict[str, Any], groups: Sequence[Sequence[str]], report: Report) -> dict[str, str]:
     """The split of every frame that is used, by name; `groups` are the states' frame names, sorted."""
-    if not any(f"{split}_filenames" in meta for split in SPLITS):
+    if all(meta.get(f"{split}_filenames") is None for split in SPLITS):
         return {name: "test" if i % 8 == 7 else "train" for names in groups for i, name in enumerate(names)}
     names = {name for group in groups for name in group}
     by_path = {os.path.abspath(file.parent / name): name for name in names}

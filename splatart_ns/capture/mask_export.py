@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from splatart_ns.capture.annotated_image import AnnotatedImage, Split
-from splatart_ns.capture.capture import UNLABELLED, CaptureError, Frame, State
+from splatart_ns.capture.capture import UNLABELLED, CaptureError, State
 from splatart_ns.capture.class_list import (
     BACKGROUND_NAMES,
     CLASS_LISTS,
@@ -187,11 +188,13 @@ def write_mask_classes(file: Path, names: Mapping[int, str]) -> None:
         csv.writer(opened, lineterminator="\n").writerows([("Pixel Value", "Class"), *names.items()])
 
 
-def mask_path(state: State, frame: Frame) -> PurePosixPath:
-    """Where an export has the mask of a frame, so that it finds the frame again: `STATE/images/0001.png`, or
-    `STATE/images/0001.jpg.png` where the suffix alone tells two images of the state apart."""
-    path = PurePosixPath(frame.name)
-    bare = path.with_suffix("")
-    alike = sum(PurePosixPath(other.name).with_suffix("") == bare for other in state.frames)
-    inner = [part for part in (path if alike > 1 else bare).parts if part not in ("..", "/")]
-    return PurePosixPath(state.name, *inner[:-1], f"{inner[-1]}.png")
+def mask_paths(state: State) -> dict[str, PurePosixPath]:
+    """Where an export has the masks of a state's frames, by their names, so that it finds the frames again:
+    `STATE/images/0001.png`, or `STATE/images/0001.jpg.png` where the suffix alone tells two images apart."""
+    paths = {frame.name: PurePosixPath(frame.name) for frame in state.frames}
+    alike = Counter(path.with_suffix("") for path in paths.values())
+    for name, path in paths.items():
+        bare = path.with_suffix("")
+        inner = [part for part in (path if alike[bare] > 1 else bare).parts if part not in ("..", "/")]
+        paths[name] = PurePosixPath(state.name, *inner[:-1], f"{inner[-1]}.png")
+    return paths

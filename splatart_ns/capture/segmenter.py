@@ -11,7 +11,7 @@ import numpy as np
 
 from splatart_ns.capture.capture import Capture, CaptureError, Frame, State
 from splatart_ns.capture.images import MAX_LABEL, read_image, read_sized, write_png
-from splatart_ns.capture.mask_export import mask_path, write_mask_classes
+from splatart_ns.capture.mask_export import mask_paths, write_mask_classes
 from splatart_ns.capture.values import parse_number, read_json, show
 from splatart_ns.errors import InputError, first_line
 from splatart_ns.files import new_folder
@@ -52,6 +52,7 @@ def segment(capture: Capture, prompts: Path, output: Path, segmenter: Segmenter)
         raise CaptureError(prompts, f"two parts are called {show(min(same))}", "spell it alike everywhere")
     if len(names) > MAX_LABEL:
         raise CaptureError(prompts, f"there are {len(names)} parts", f"name at most {MAX_LABEL}")
+    paths = {state.name: mask_paths(state) for state in capture.states}
     with new_folder(output) as folder:
         for key, parts in wanted.items():
             state, frame = frames[key]
@@ -59,7 +60,7 @@ def segment(capture: Capture, prompts: Path, output: Path, segmenter: Segmenter)
             logits = segmenter(image, list(parts.values()))
             ids = np.array([names.index(name) + 1 for name in parts], np.uint8)
             labels = np.where(logits.max(axis=0) > 0, ids[logits.argmax(axis=0)], np.uint8(0))
-            write_png(folder / mask_path(state, frame), labels)
+            write_png(folder / paths[state.name][frame.name], labels)
         write_mask_classes(folder / "_classes.csv", dict(enumerate(names, start=1)))
     return len(wanted)
 

@@ -135,9 +135,9 @@ def show(value: Any) -> str:
 def own_before(entry: dict[str, Any], meta: dict[str, Any]) -> dict[str, Any]:
     """A frame's own values, and those of its file that they do not replace: a focal length of its own replaces both, in
     either form, and so does a distortion."""
-    given = {key for key, value in entry.items() if value is not None}
-    replaced = {key for group in _TOGETHER if group & given for key in group}
-    return {key: value for key, value in meta.items() if key not in replaced} | entry
+    given = {key: value for key, value in entry.items() if value is not None}
+    replaced = {key for group in _TOGETHER if group & given.keys() for key in group}
+    return {key: value for key, value in meta.items() if key not in replaced} | given
 
 
 def parse_camera(file: Path, owner: str, values: dict[str, Any], image: Path) -> Camera:

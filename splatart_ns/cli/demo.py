@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,6 +12,7 @@ from splatart_ns.cli.bundle import Evaluate
 from splatart_ns.cli.common import CONSOLE
 from splatart_ns.cli.fit import Fit
 from splatart_ns.cli.render import Render
+from splatart_ns.errors import InputError
 
 
 @dataclass
@@ -28,10 +28,14 @@ class Demo:
 
     def run(self) -> None:
         from splatart_ns.capture.procedural import synthesize_object
+        from splatart_ns.records import read_record
 
         capture, bundle = self.output_dir / "capture", self.output_dir / "bundle"
-        if not (capture / "ground_truth.json").exists():
-            shutil.rmtree(capture, ignore_errors=True)
+        if (truth := capture / "ground_truth.json").is_file():
+            made_of = read_record(truth, "remove it").record("source").text("robot_name")
+            if made_of != self.object:
+                raise InputError(f"{capture}: is of {made_of!r}; give another --output-dir, or remove it.")
+        else:
             options = SynthesisOptions(train_views=30, resolution=192)
             CONSOLE.print(f"Rendering a capture of the built-in {self.object} ...")
             synthesize_object(self.object, capture, options)

@@ -24,7 +24,7 @@ from splatart_ns.evaluation.images import image_scores, is_mapped, novel_motions
 from splatart_ns.evaluation.joints import joint_errors, mean_errors
 from splatart_ns.evaluation.parts import part_pose_errors
 from splatart_ns.evaluation.structure import structure_scores
-from splatart_ns.files import write_json
+from splatart_ns.files import require_writable, write_json
 from splatart_ns.records import read_record
 
 
@@ -36,6 +36,7 @@ def evaluate(bundle_folder: Path, capture_path: Path, device: torch.device | str
     """
     bundle_folder, capture_path = Path(bundle_folder), Path(capture_path)
     bundle = load_bundle(bundle_folder)
+    require_writable(bundle_folder, "metrics.json goes there: evaluate a copy of the bundle")
     capture = load_capture(capture_path)
     if len(capture.states) != len(bundle.states):
         raise InputError(

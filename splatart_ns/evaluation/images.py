@@ -76,6 +76,8 @@ def image_scores(
         counts = torch.ones_like(shown, dtype=torch.bool)
         if given is not None and view.alpha is None:  # labels may leave open whose a pixel is
             counts = view.labels != UNLABELLED
+            if not counts.any():
+                continue
             truth = torch.where(counts[..., None], truth, image)
         per_view["psnr"].append(psnr(image[counts], truth[counts]))
         per_view["ssim"].append(float(ssim(image, truth)))

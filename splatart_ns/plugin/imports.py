@@ -17,6 +17,23 @@ UNUSED = frozenset({"torchvision.datasets", "torchvision.models", "torchvision.o
 COMPILER = "torch._dynamo"
 
 
+class _Lazily(LazyLoader):
+    """Loads a module when an attribute of it is used. Until then it has no file: `inspect` asks all modules for theirs,
+    in the middle of imports that some of them need."""
+
+    def exec_module(self, module: ModuleType) -> None:
+        super().exec_module(module)
+        unloaded = type(module)
+
+        class Unloaded(unloaded):
+            def __getattribute__(self, name: str) -> Any:
+                if name == "__file__":
+                    raise AttributeError(name)
+                return unloaded.__getattribute__(self, name)
+
+        module.__class__ = Unloaded
+
+
 class _OnFirstUse:
     """Finds the modules of `UNUSED` such that they are loaded when somebody uses them after all."""
 
@@ -26,7 +43,7 @@ class _OnFirstUse:
             return None
         spec = PathFinder.find_spec(name, path, target)
         if spec is not None and spec.loader is not None:
-            spec.loader = LazyLoader(spec.loader)
+            spec.loader = _Lazily(spec.loader)
         return spec
 
 

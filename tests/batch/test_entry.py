@@ -157,7 +157,16 @@ def test_a_manifest_with_a_mistake_names_the_line_and_the_mend(make, tmp_path, t
 
 
 @pytest.mark.parametrize(
-    "line", ["[1]", "{", '{"path": 3}', '{"path": "a", "joints": "lid"}', '{"path": "a", "seed": true}']
+    "line",
+    [
+        "[1]",
+        "{",
+        '{"path": 3}',
+        r'{"path": "a\u0000b", "name": "a"}',
+        r'{"path": "a\ud800", "name": "a"}',
+        '{"path": "a", "joints": "lid"}',
+        '{"path": "a", "seed": true}',
+    ],
 )
 def test_a_line_that_is_no_object_or_has_a_wrong_value_is_named(make, tmp_path, line):
     make("list.jsonl", '{"path": "fine"}\n' + line)

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from splatart_ns.bundle import posed_splat
+from splatart_ns.bundle import camera, posed_splat
 from splatart_ns.bundle.camera import Camera, bounding_sphere, capture_camera, front_azimuth, orbit_camera
+from splatart_ns.bundle.posing import configured_motions
 from splatart_ns.capture import capture
 from splatart_ns.capture.capture import Capture, Frame, State
 from splatart_ns.errors import InputError
@@ -23,6 +24,16 @@ def test_the_whole_object_is_in_the_picture_at_all_configurations(bundle, azimut
         pixels, depths = project_points(posed_splat(bundle, q).means.double(), viewmat, K)
         assert (depths > 0).all()
         assert ((pixels >= 0) & (pixels <= torch.tensor(size))).all()
+
+
+def test_thousands_of_configurations_are_sized_by_an_even_choice_of_them(bundle, monkeypatch):
+    asked = []
+    monkeypatch.setattr(camera, "configured_motions", lambda b, q: asked.append(q) or configured_motions(b, q))
+    configurations = [{"slide": x} for x in np.linspace(0, 3, 5000)]
+    centre, radius = bounding_sphere(bundle, configurations)
+    assert len(asked) == camera.SIZED_BY and asked[0] == configurations[0] and asked[-1] == configurations[-1]
+    whole = bounding_sphere(bundle, configurations[::10])
+    assert centre == pytest.approx(whole[0], abs=0.01) and radius == pytest.approx(whole[1], rel=0.01)
 
 
 def test_the_camera_stands_where_it_is_asked_to_and_upright():

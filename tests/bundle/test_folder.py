@@ -59,20 +59,21 @@ def test_saving_leaves_only_the_bundles_files(folder):
     assert files == {"articulation.json", "parts/base.ply", "parts/door.ply", "parts/latch.ply"}
 
 
-def test_part_names_that_are_no_file_names_stay_inside_and_apart(bundle, tmp_path):
-    for part, name in zip(bundle.parts, ["../../a", "__/__/A", "ü"], strict=True):
+@pytest.mark.parametrize("names", [["../../a", "__/__/A", "ü"], ["a_b_3", "a.b", "a_b"]])
+def test_part_names_that_are_no_file_names_stay_inside_and_apart(bundle, tmp_path, names):
+    for part, name in zip(bundle.parts, names, strict=True):
         for joint in bundle.joints:
             joint.parent = name if joint.parent == part.name else joint.parent
             joint.child = name if joint.child == part.name else joint.child
             for other in joint.alternatives:
                 other.update({"parent": name} if other.get("parent") == part.name else {})
         part.name = name
-    bundle.root = "../../a"
+    bundle.root = names[0]
     bundle.loops = []
     save_bundle(bundle, tmp_path / "out")
     assert {p.name for p in tmp_path.iterdir()} == {"out"}
     assert len(list((tmp_path / "out" / "parts").iterdir())) == 3
-    assert load_bundle(tmp_path / "out").part_names == ["../../a", "__/__/A", "ü"]
+    assert load_bundle(tmp_path / "out").part_names == names
 
 
 def set_(*path, value):

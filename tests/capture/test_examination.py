@@ -332,6 +332,25 @@ def test_it_is_told_how_much_labelled_frames_show(capture):
     assert f"of what all frames show  {f'{first:.0%}':>10}  {'100%':>10}" in as_text(examination)
 
 
+def test_a_capture_that_nobody_labelled_yet_is_examined_and_told_what_to_label(capture):
+    """The first thing that a user runs."""
+    for state in load_capture(capture).states:
+        unlabel(capture, state.name, range(len(state.frames)))
+        change_json(capture / state.name / "transforms.json", lambda meta: meta.pop("semantic_classes"))
+    examination = examine(capture, suggest=2)
+    text = as_text(examination)
+    assert "no training frame has part labels" in text and text.count("label next: ") == 2
+    assert f"of what all frames show  {'0%':>10}  {'0%':>10}" in text
+
+
+def test_labels_and_classes_of_the_background_alone_are_told(capture):
+    for state in ("state_00", "state_01"):
+        change_all(capture / state / "semantics", np.zeros_like)
+        change_json(capture / state / "transforms.json", lambda meta: meta.update(semantic_classes=["background"]))
+    examination = examine(capture)
+    assert examination.errors and as_text(examination)
+
+
 def test_what_is_no_capture_is_one_problem(tmp_path):
     examination = examine(tmp_path)
     assert examination.capture is None and examination.errors == len(examination.problems) == 1

@@ -142,6 +142,22 @@ def test_a_frames_own_focal_length_or_distortion_replaces_the_files_in_either_fo
     assert (third.fx, third.fy, third.distortion[0]) == (20, 20, 0.1)
 
 
+def test_what_a_frame_leaves_open_is_as_the_file_says(capture_folder, edit):
+    expected = load_capture(capture_folder).states[0].frames
+    empty = dict.fromkeys(("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "depth_unit_scale_factor"))
+    edit(capture_folder / FILE, lambda m: m["frames"][0].update(empty))
+    edit(capture_folder / FILE, lambda m: m.update(depth_unit_scale_factor=None))
+    found = load_capture(capture_folder).states[0].frames
+    assert [(f.camera, f.depth_unit) for f in found] == [(f.camera, f.depth_unit) for f in expected]
+    edit(capture_folder / FILE, lambda m: m.update(depth_unit_scale_factor=0.5))
+    assert {frame.depth_unit for frame in load_capture(capture_folder).states[0].frames} == {0.5}
+    splits = [f"{split}_filenames" for split in ("train", "val", "test")]
+    edit(capture_folder / FILE, lambda m: [m.pop(key, None) for key in splits])
+    expected = [frame.split for frame in load_capture(capture_folder).states[0].frames]
+    edit(capture_folder / FILE, lambda m: m.update(dict.fromkeys(splits)))
+    assert [frame.split for frame in load_capture(capture_folder).states[0].frames] == expected
+
+
 @pytest.mark.parametrize("model", ["opencv", "Pinhole", None])
 def test_a_camera_model_may_be_spelled_otherwise_or_be_missing(capture_folder, edit, model):
     expected = load_capture(capture_folder).states[0].frames[0].camera
@@ -192,7 +208,7 @@ def test_a_count_of_depth_is_a_millimetre_unless_the_file_or_the_frame_says_othe
     assert [f.depth_unit for f in load_capture(capture_folder).states[0].frames[:3]] == [0.25, 2, 0.25]
 
 
-@pytest.mark.parametrize("unit", [0, -1, "mm", None, True, 1e300])
+@pytest.mark.parametrize("unit", [0, -1, "mm", True, 1e300])
 def test_a_unit_of_depth_that_is_no_length_is_refused(capture_folder, edit, unit):
     edit(capture_folder / FILE, lambda meta: meta.update(depth_unit_scale_factor=unit))
     with pytest.raises(InputError, match="depth_unit_scale_factor of frame 'images/0000.png' is "):

@@ -63,6 +63,9 @@ def test_labels_are_silhouettes_and_unlabelled_pixels_do_not_count(bundle, captu
     scores, notes = image_scores(bundle, observed_motions(bundle, 0), views, load_capture(capture))
     assert scores["silhouette"] == "given" and notes == []
     assert scores["psnr"] > 20 and scores["accumulation_l1"] < 0.05
+    nothing = replace(opaque_views[0], labels=torch.full_like(labels, UNLABELLED))
+    with_it, _ = image_scores(bundle, observed_motions(bundle, 0), [nothing, *views], load_capture(capture))
+    assert with_it["psnr"] == scores["psnr"] and with_it["accumulation_l1"] == scores["accumulation_l1"]
     bundle.parts[1].motion[0, :3, 3] += 0.3
     moved, _ = image_scores(bundle, observed_motions(bundle, 0), views, load_capture(capture))
     assert moved["psnr"] < scores["psnr"] - 3 and moved["accumulation_l1"] > 2 * scores["accumulation_l1"]

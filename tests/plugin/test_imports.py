@@ -21,6 +21,8 @@ for _ in range(2):
 assert from_rotation_translation(torch.eye(3), torch.ones(2, 3)).shape == (2, 4, 4)
 print(*{"sympy", "torch._inductor", "torchvision.models.resnet"} & set(sys.modules))
 
+# In the midst of what this imports all modules are asked for their files.
+torch.testing.assert_close(torch.ones(2), torch.ones(2))
 assert torch.equal(torch.compile(lambda x: 2 * x, backend="eager")(torch.ones(2)), torch.full((2,), 2.0))
 import torchvision
 print(torchvision.models.resnet18.__name__, torch._dynamo.__name__, "sympy" in sys.modules)

@@ -43,7 +43,17 @@ def simulate(path: Path) -> Run:
     """
     import mujoco
 
-    model = mujoco.MjModel.from_xml_path(str(path))
+    told = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)  # else it writes a log file where the user stands; `data` counts them
+    try:
+        return _driven(mujoco.MjModel.from_xml_path(str(path)))
+    finally:
+        mujoco.set_mju_user_warning(told)
+
+
+def _driven(model) -> Run:
+    import mujoco
+
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     at_rest = touched = _contacts(model, data)
