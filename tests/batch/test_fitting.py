@@ -125,6 +125,18 @@ def test_a_page_of_a_bundle_takes_no_meshes(tmp_path, monkeypatch):
     assert (tmp_path / "work/export/html/box.html").exists()
 
 
+def test_a_new_bundle_has_neither_exports_nor_metrics_of_the_one_before(tmp_path):
+    save_box(tmp_path / "out/box", seed=0)
+    for old in ("metrics.json", "export/urdf/box.urdf", "export/urdf/meshes/a.stl"):
+        (tmp_path / "out/box" / old).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "out/box" / old).touch()
+    work = Work(Entry("box", ""), open_storage(str(tmp_path / "out")), tmp_path / "work")
+    for _ in range(2):  # the second time there is none
+        work.discard("metrics.json", "export")
+        assert {f.suffix for f in (tmp_path / "out/box").rglob("*") if f.is_file()} == {".json", ".ply"}
+        assert not (tmp_path / "out/box/metrics.json").exists()
+
+
 def stages(settings, told, **recipe):
     return {stage.name: stage for stage in Fitting(**recipe).stages(Entry("a", "", SETTINGS | settings), "files", told)}
 

@@ -285,3 +285,16 @@ def test_pose_errors_are_relative_to_the_object(objects, tmp_path):
     moved.links["p1"] = dataclasses.replace(link, origin=link.origin + 1e-7)
     found = report(validate(path, "glb", bundle, moved))
     assert found["trimesh", "link poses"][0] == "failed"
+
+
+def test_a_simulation_that_explodes_is_told_and_leaves_no_log_where_one_stands(tmp_path, monkeypatch):
+    pytest.importorskip("mujoco")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    (tmp_path / "robot.xml").write_text(
+        """<mujoco><option timestep="0.5"/><worldbody><body>
+        <joint name="j" type="slide" axis="1 0 0" range="-1 1" stiffness="1e9"/><geom size="0.1" mass="0.001"/>
+        </body></worldbody><actuator><position joint="j" kp="1e9" ctrlrange="-1 1"/></actuator></mujoco>"""
+    )
+    assert not simulate(tmp_path / "robot.xml").stable
+    assert not list((tmp_path / "here").iterdir())
