@@ -20,6 +20,10 @@ from splatart_ns.splats.splat import Splat
 FAINT = 0.1
 """Gaussians below this opacity are haze in front of surfaces, where there are others."""
 _VIEWS = 48
+"""From all around."""
+_CAMERAS, _APART = 48, math.cos(math.radians(6))
+"""And at most so many from where cameras looked, each by this from all others: of those all around few look into a
+hollow, and where the Gaussians in it are is known from there best."""
 _DISTANCE = 5.0
 """From the cameras to the part's centre, in its radii: far enough to see into cavities, near enough for float32."""
 _SLICES = 16
@@ -28,6 +32,8 @@ _BLIND = math.cos(math.radians(35))
 """Into what views from directions that differ by more than this from all cameras' see no camera looked. (With 25 to 45
 degrees meshes of eight pieces of furniture come equally near the truth in the mean: the smaller, the fuller is a box
 on the ground, and the further off a cupboard on a skirting.)"""
+_BESIDE = 8
+"""Pixels around what need be seen that are looked at, too."""
 _HIDDEN = 2.0
 """What lies so much further than what stands before it is hidden by that, voxels."""
 _FRONT_PIXELS = 128
@@ -45,28 +51,31 @@ class DepthView:
     viewmat: Tensor
     K: Tensor
     image: Tensor
-    """Channels [6, H, W]: the accumulation, and times the accumulation: depth less _DISTANCE, colour, and how much
-    nearer the surface is where it is an outer one."""
-    fronts: Tensor
+    """Channels [6, H, W]: the accumulation, and times the accumulation: depth less _DISTANCE, how much nearer the
+    surface is where it is an outer one, and colour."""
+    fronts: Tensor | None
     """Depth less _DISTANCE of what stands around the part, at each state [S, h, w], infinite where nothing does."""
     blind: bool
     """Whether no camera looked from about this direction, as far as that is known."""
     direction: Tensor
     """From the middle to the camera [3], a unit vector, float64."""
 
-    def sample(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What is seen at `points` [N, 3]: accumulation [N], how far behind each the surface lies [N], its colour
-        [N, 3], and how much nearer it is if it is an outer one [N]."""
+    def sample(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What is seen at `points` [N, 3]: accumulation [N], how far behind each the surface lies [N], and how much
+        nearer it is if it is an outer one [N]."""
         uv, z = project_points(points, self.viewmat, self.K)
-        at = (uv * (2 / self.image.shape[-1]) - 1)[None, None]
-        values = F.grid_sample(self.image[None], at, align_corners=False)[0, :, 0]
-        accumulation, rest = values[0], values[1:] / values[0].clamp_min(1e-6)
-        return accumulation, rest[0] - (z - _DISTANCE), rest[1:4].T, rest[4]
+        accumulation, depth, nearer = _at(self.image[:3], uv)
+        weight = accumulation.clamp_min(1e-6)
+        return accumulation, depth / weight - (z - _DISTANCE), nearer / weight
 
     def shows(self, points: Tensor, band: float) -> Tensor:
         """At which of `points` [N, 3] the seen surface is, or within `band` of them [N] bool."""
-        accumulation, behind, _, nearer = self.sample(points)
+        accumulation, behind, nearer = self.sample(points)
         return (accumulation > 0.5) & (behind > -band) & (behind < nearer + band)
+
+    def colours(self, points: Tensor) -> Tensor:
+        """Of what is seen at `points` [N, 3], times the accumulation there [N, 3]."""
+        return _at(self.image[3:], project_points(points, self.viewmat, self.K)[0]).T
 
     def towards(self, points: Tensor) -> Tensor:
         """Unit vectors from `points` [N, 3] to the camera [N, 3]."""
@@ -74,8 +83,8 @@ class DepthView:
 
     def hidden(self, points: Tensor, voxel: float) -> Tensor:
         """Which of `points` [N, 3] lie behind what stands before the part in all states [N] bool; all do if blind."""
-        if self.blind:
-            return torch.ones(len(points), dtype=torch.bool)
+        if self.blind or self.fronts is None:
+            return torch.full((len(points),), self.blind)
         uv, z = project_points(points, self.viewmat, self.K)
         size = self.fronts.shape[-1]
         column, row = (uv * (size / self.image.shape[-1])).long().clamp(0, size - 1).unbind(-1)
@@ -90,6 +99,12 @@ class DepthView:
         return (F.pad(ray, (0, 1), value=1.0) * z[:, None] - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
 
 
+def _at(image: Tensor, uv: Tensor) -> Tensor:
+    """The channels of a square image [C, H, H] at pixels [N, 2]: [C, N]."""
+    at = (uv * (2 / image.shape[-1]) - 1)[None, None]
+    return F.grid_sample(image[None], at, align_corners=False)[0, :, 0]
+
+
 def look_around(
     splat: Splat,
     centre: Tensor,
@@ -97,15 +112,31 @@ def look_around(
     pixels: int,
     around: Sequence[Splat] = (),
     towards: Tensor | None = None,
+    half: Tensor | None = None,
 ) -> list[DepthView]:
     """Views of the sphere about `centre` [3], made the unit sphere, `pixels` wide and high, from all around.
 
-    `towards` [M, 3] are the directions of the cameras, if they are known.
+    `towards` [M, 3] are the directions of the cameras, if they are known: from there it is looked at, too. `half` [3]
+    are half the sides of the box about the centre outside of which nothing need be seen.
     """
     unit, *others = (_unit(of, centre, radius) for of in (splat, *around))
-    directions = golden_spiral(1 - (2 * torch.arange(_VIEWS, dtype=torch.float64) + 1) / _VIEWS)
+    directions = _directions(towards)
     blind = [False] * _VIEWS if towards is None else ((directions @ towards.mT).amax(-1) < _BLIND).tolist()
-    return [_look(unit, others, *each, pixels) for each in zip(directions, blind, strict=True)]
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
+    box = corners if half is None else corners * (half / radius).float()
+    return [_look(unit, others, *each, pixels, box) for each in zip(directions, blind, strict=True)]
+
+
+def _directions(towards: Tensor | None) -> Tensor:
+    """Unit vectors [V, 3] float64: all around, then those of `towards` [M, 3] that are farthest from all before."""
+    directions = golden_spiral(1 - (2 * torch.arange(_VIEWS, dtype=torch.float64) + 1) / _VIEWS)
+    if towards is None:
+        return directions
+    chosen, nearest = [], (towards @ directions.mT).amax(-1)
+    while len(chosen) < _CAMERAS and nearest.min() < _APART:
+        chosen.append(towards[nearest.argmin()])
+        nearest = torch.maximum(nearest, towards @ chosen[-1])
+    return torch.cat([directions, *(direction[None] for direction in chosen)])
 
 
 def _unit(splat: Splat, centre: Tensor, radius: float) -> Splat:
@@ -121,7 +152,8 @@ def _unit(splat: Splat, centre: Tensor, radius: float) -> Splat:
     )
 
 
-def _look(splat: Splat, around: Sequence[Splat], direction: Tensor, blind: bool, pixels: int) -> DepthView:
+def _look(splat: Splat, around: Sequence[Splat], direction: Tensor, blind: bool, pixels: int, box: Tensor) -> DepthView:
+    """One view of `pixels` by `pixels`, in which what lies beside the corners of a box [8, 3] is left empty."""
     forward = -direction
     side = torch.linalg.cross(forward, torch.eye(3, dtype=torch.float64)[int(forward.abs().argmin())])
     side = side / side.norm()
@@ -131,6 +163,11 @@ def _look(splat: Splat, around: Sequence[Splat], direction: Tensor, blind: bool,
     viewmat = viewmat.float()
     focal = pixels / 2 * math.sqrt(_DISTANCE**2 - 1)
     K = torch.tensor([[focal, 0, pixels / 2], [0, focal, pixels / 2], [0, 0, 1]])
+    uv = project_points(box, viewmat, K)[0]
+    left, top = (uv.amin(0) - _BESIDE).floor().long().clamp(0, pixels - 1).tolist()
+    right, bottom = (uv.amax(0) + _BESIDE).ceil().long().clamp(1, pixels).tolist()
+    width, height = right - left, bottom - top
+    of_piece = K - torch.tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
 
     z = transform_points(viewmat, splat.means)[:, 2]
     layer = ((z - z.min()) * (_SLICES / (z.max() - z.min()).clamp_min(1e-9))).long().clamp_max(_SLICES - 1)
@@ -141,24 +178,26 @@ def _look(splat: Splat, around: Sequence[Splat], direction: Tensor, blind: bool,
         *(splat.means, splat.quats, splat.scales, splat.opacities),
         torch.cat(
             [
-                splat.base_colours,
                 nearer[:, None],
+                splat.base_colours,
                 (planes[:, :, None] * F.one_hot(layer, _SLICES)[:, None]).flatten(1),
             ],
             1,
         ),
-        *(viewmat[None], K[None], pixels, pixels),
+        *(viewmat[None], of_piece[None], width, height),
         eps2d=PIXEL_VARIANCE,
     )
     weight, at_centre, along_x, along_y = image[0, ..., 4:].unflatten(-1, (4, _SLICES)).unbind(-2)
     from_centre = torch.arange(pixels)[:, None] + 0.5 - pixels / 2
-    depth = _median_depth(weight, at_centre + along_x * from_centre + along_y * from_centre[:, None])
+    across, down = from_centre[left:right], from_centre[top:bottom, None]
+    depth = _median_depth(weight, at_centre + along_x * across + along_y * down)
     channels = torch.cat([accumulation[0], accumulation[0] * depth[..., None], image[0, ..., :4]], -1)
     size = min(pixels, _FRONT_PIXELS)
     smaller = torch.diag(torch.tensor([size / pixels, size / pixels, 1.0])) @ K
-    fronts = [_front(other, viewmat, smaller, size) for other in around]
-    fronts = torch.stack(fronts) if fronts else torch.full((1, 1, 1), torch.inf)
-    return DepthView(viewmat, K, channels.permute(2, 0, 1).contiguous(), fronts, blind, direction)
+    fronts = [_front(other, viewmat, smaller, size) for other in around if not blind]  # which does not ask
+    fronts = torch.stack(fronts) if fronts else None
+    whole = F.pad(channels.permute(2, 0, 1), (left, pixels - right, top, pixels - bottom))
+    return DepthView(viewmat, K, whole, fronts, blind, direction)
 
 
 def _front(splat: Splat, viewmat: Tensor, K: Tensor, pixels: int) -> Tensor:

@@ -43,6 +43,8 @@ _THICKEN = 0.75
 """What surfaces lie further out by in the field, voxels: a sheet that both sides see at one depth would have holes."""
 _LEFT_THICK = 0.25
 """What of this the mesh keeps, voxels."""
+_AT_ONCE = 2**16
+"""So many places are looked at together: it takes half a kilobyte of memory for each."""
 _COARSE = 4
 """Voxels between the places where the field is looked at far from any surface."""
 _MIN_COMPONENT = 0.01
@@ -111,7 +113,9 @@ def part_surface(
 
     while True:
         voxel = float((8 * half.prod() / voxels) ** (1 / 3))
-        views = look_around(splat, centre, radius, math.ceil(2 / voxel), around, towards)
+        views = look_around(
+            splat, centre, radius, math.ceil(2 / voxel), around, towards, torch.from_numpy(half) * radius
+        )
         level = _zero_level(views, half, voxel, extent)
         if level is None:
             return _hull(splat, ends)
@@ -187,14 +191,17 @@ def _zero_level(
     origin = -voxel * _COARSE * cells / 2
     axes = [torch.from_numpy(origin[k] + voxel * np.arange(_COARSE * cells[k] + 1)).float() for k in range(3)]
 
-    nodes = [axis[::2] for axis in axes]
-    beside = sum((view.sample(torch.cartesian_prod(*nodes))[0] < 0.5).int() for view in views)
-    inside = (beside < _AGREEING).numpy().reshape([len(axis) for axis in nodes])
+    every_second = torch.cartesian_prod(*[axis[::2] for axis in axes])
+    beside = sum((view.sample(every_second)[0] < 0.5).int() for view in views)
+    inside = (beside < _AGREEING).numpy().reshape([len(axis[::2]) for axis in axes])
     hull = Hull.of(inside, origin, 2 * voxel)
 
     def field_at(nodes: Tensor) -> np.ndarray:
-        points = torch.stack([axis[i] for axis, i in zip(axes, nodes.unbind(-1), strict=True)], -1)
-        return _field(views, points, voxel, extent, hull.outside(points)).numpy()
+        found = []
+        for some in nodes.split(_AT_ONCE):
+            points = torch.stack([axis[i] for axis, i in zip(axes, some.unbind(-1), strict=True)], -1)
+            found.append(_field(views, points, voxel, extent, hull.outside(points)))
+        return torch.cat(found).numpy()
 
     coarse_nodes = torch.cartesian_prod(*[torch.arange(0, len(axis), _COARSE) for axis in axes])
     coarse = field_at(coarse_nodes).reshape(cells + 1)
@@ -231,21 +238,23 @@ def _field(views: list[DepthView], points: Tensor, voxel: float, extent: Extent 
     nothing within the part's `extent` where others hid it from them in all states, or they are blind; None, where
     neither could be.
     """
-    within = None if extent is None else extent.holds(points)
-    found, hardly = torch.empty(len(points), len(views)), torch.zeros(len(points))
+    within = torch.zeros(0, dtype=torch.long) if extent is None else extent.holds(points).nonzero()[:, 0]
+    outer = outside.nearness.nonzero()[:, 0]
+    outside = Outside(outside.nearness[outer], outside.direction[outer])
+    found, hardly = torch.empty(len(views), len(points)), torch.zeros(len(points))
     for k, view in enumerate(views):
-        accumulation, behind, _, nearer = view.sample(points)
-        past = (behind - nearer * outside.share(view.towards(points))) / voxel
+        accumulation, past, nearer = view.sample(points)
+        past[outer] -= nearer[outer] * outside.share(view.towards(points[outer]))
+        past /= voxel
         value = torch.maximum(((past - _THICKEN) / _BAND).clamp(-1, 1), 1 - 2 * accumulation)
         by_little = (accumulation > 0.5) & (past > 0) & (past < _HARDLY)
-        if within is not None:
-            hidden = within & view.hidden(points, voxel)
-            value[hidden] = -1.0
-            by_little &= ~hidden
-        found[:, k] = value
+        hidden = within[view.hidden(points[within], voxel)]
+        value[hidden], by_little[hidden] = -1.0, False
+        found[k] = value
         hardly += by_little
     takes = (_SHARE * hardly).ceil().clamp_min(_AGREEING).long()
-    return found.sort(descending=True).values.gather(1, takes[:, None] - 1)[:, 0]
+    ordered = torch.from_numpy(np.sort(np.ascontiguousarray(found.T.numpy()), axis=1))  # 10 times as fast as torch's
+    return ordered.gather(1, len(views) - takes[:, None])[:, 0]
 
 
 def _without_floaters(vertices: np.ndarray, faces: np.ndarray) -> manifold3d.Manifold:
@@ -291,9 +300,8 @@ def _vertex_colours(views: list[DepthView], points: Tensor, band: float) -> tupl
     """Colours [N, 4] uint8 that the views see within `band` of points [N, 3], and whether any view sees them [N]."""
     total = torch.zeros(len(points), 4)
     for view in views:
-        accumulation, _, colour, _ = view.sample(points)
-        weight = accumulation * view.shows(points, band)
-        total += weight[:, None] * F.pad(colour, (0, 1), value=1.0)
+        shown = view.shows(points, band)[:, None]
+        total += shown * torch.cat([view.colours(points), view.sample(points)[0][:, None]], -1)
     seen = total[:, 3] > 0
     # What nobody saw takes the mean colour.
     rgb = torch.where(

@@ -237,6 +237,20 @@ def test_the_underside_at_which_no_camera_looked_is_closed():
     assert from_below.bounds[1, 2] == pytest.approx(0.2, abs=0.03)
 
 
+def test_a_deep_hollow_is_open_as_far_as_cameras_looked_into_it():
+    """Of the directions all around hardly any leads to its floor."""
+    box = trimesh.creation.box((0.8, 0.6, 2.0))
+    box.update_faces(box.face_normals[:, 2] < 0.5)
+    angle = torch.arange(12, dtype=torch.float64) * (math.pi / 6)
+    rings = [(r * angle.cos(), r * angle.sin(), torch.full_like(angle, 6.0)) for r in (0.5, 1.2, 2.5, 6.0)]
+    cameras = torch.cat([torch.stack(ring, -1) for ring in rings])
+    mesh = part_surface(splat_on(box, 8000), cameras, voxels=VOXELS)
+    assert_solid(mesh)
+    assert mesh.volume < 0.35 * 0.8 * 0.6 * 2.0
+    x, y, z = mesh.vertices.T
+    assert z[(np.abs(x) < 0.25) & (np.abs(y) < 0.18)].max() == pytest.approx(-1.0, abs=0.1)
+
+
 def test_a_hollow_stays_that_another_part_uncovers_in_some_state():
     alone = part_surface(open_box(), voxels=VOXELS)
     uncovered = part_surface(open_box(), around=[lying_on(0.2), lying_on(3.0)], voxels=VOXELS)
