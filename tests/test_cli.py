@@ -363,7 +363,7 @@ def test_demo_goes_from_nothing_to_a_film(run_main, monkeypatch, hinge_fit, tmp_
     assert sorted(f.name for f in (tmp_path / "demo").iterdir()) == ["bundle", "capture", "sweep.gif"]
     assert (tmp_path / "demo/bundle/metrics.json").is_file()
     code, _, errors = run_main("demo", "--output-dir", tmp_path / "demo", "--object", "drawer")
-    assert code == 2 and f"{tmp_path}/demo/capture: is of 'hinge'" in errors
+    assert code == 2 and f"{tmp_path}/demo/capture: shows no drawer" in errors
 
 
 def test_demo_leaves_a_users_own_folder_alone(run_main, tmp_path):

@@ -28,13 +28,14 @@ class Demo:
 
     def run(self) -> None:
         from splatart_ns.capture.procedural import synthesize_object
-        from splatart_ns.records import read_record
+        from splatart_ns.capture.values import read_json
 
         capture, bundle = self.output_dir / "capture", self.output_dir / "bundle"
         if (truth := capture / "ground_truth.json").is_file():
-            made_of = read_record(truth, "remove it").record("source").text("robot_name")
+            source = read_json(truth).get("source")
+            made_of = source.get("robot_name") if isinstance(source, dict) else None
             if made_of != self.object:
-                raise InputError(f"{capture}: is of {made_of!r}; give another --output-dir, or remove it.")
+                raise InputError(f"{capture}: shows no {self.object}; give another --output-dir, or remove it.")
         else:
             options = SynthesisOptions(train_views=30, resolution=192)
             CONSOLE.print(f"Rendering a capture of the built-in {self.object} ...")

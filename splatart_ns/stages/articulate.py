@@ -103,7 +103,7 @@ def forward_kinematics(
     if q.shape[-1] != sum(dofs):
         raise ValueError(f"a configuration of {q.shape[-1]} values for {sum(dofs)} of the movable joints")
     root = torch.eye(4).to(q) if root_motion is None else root_motion.to(q)
-    root = root.expand(*np.broadcast_shapes(root.shape[:-2], q.shape[:-1]), 4, 4)  # see translation
+    root = root.expand(*np.broadcast_shapes(root.shape[:-2], q.shape[:-1]), 4, 4)  # see from_rotation_translation
     motions = {tree.root: root}
     values = {id(j): v for j, v in zip(movable, q.split(dofs, -1), strict=True)}
     for joint in tree.joints:
