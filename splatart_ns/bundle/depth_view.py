@@ -22,8 +22,8 @@ FAINT = 0.1
 _VIEWS = 48
 """From all around."""
 _CAMERAS, _APART = 48, math.cos(math.radians(6))
-"""And at most so many from where cameras looked, each by this from all others: of those all around few look into a
-hollow, and where the Gaussians in it are is known from there best."""
+"""And at most so many from where cameras looked, each by the angle of this cosine from all others: of those all around
+few look into a hollow, and where the Gaussians in it are is known from there best."""
 _DISTANCE = 5.0
 """From the cameras to the part's centre, in its radii: far enough to see into cavities, near enough for float32."""
 _SLICES = 16
@@ -131,6 +131,9 @@ def _directions(towards: Tensor | None) -> Tensor:
     """Unit vectors [V, 3] float64: all around, then those of `towards` [M, 3] that are farthest from all before."""
     directions = golden_spiral(1 - (2 * torch.arange(_VIEWS, dtype=torch.float64) + 1) / _VIEWS)
     if towards is None:
+        return directions
+    towards = towards[towards.any(-1)]  # a camera in the very middle has none
+    if len(towards) == 0:
         return directions
     chosen, nearest = [], (towards @ directions.mT).amax(-1)
     while len(chosen) < _CAMERAS and nearest.min() < _APART:

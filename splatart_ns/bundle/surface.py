@@ -33,8 +33,8 @@ _HARDLY, _SHARE = 4.0, 0.5
 """And so large a share of those that see less than so many voxels past it: a flat face would sag to where the few that
 see deepest into its Gaussians have it, and there are many views of it; into a hollow few can look."""
 _SAME_SIDE = math.cos(math.radians(20))
-"""A view whose direction differs by less than this from a camera's shows what the camera saw: the views are 25 degrees
-apart."""
+"""A view whose direction differs by less than this from a camera's shows what the camera saw: those all around are 25
+degrees apart."""
 _GRAZING = math.sin(math.radians(10))
 """What a camera sees at a smaller angle than this, it hardly sees."""
 _BAND = 3.0
@@ -44,7 +44,7 @@ _THICKEN = 0.75
 _LEFT_THICK = 0.25
 """What of this the mesh keeps, voxels."""
 _AT_ONCE = 2**16
-"""So many places are looked at together: it takes half a kilobyte of memory for each."""
+"""So many places are looked at together: it takes about a kilobyte of memory for each."""
 _COARSE = 4
 """Voxels between the places where the field is looked at far from any surface."""
 _MIN_COMPONENT = 0.01
@@ -62,11 +62,11 @@ def part_surface(
 ) -> trimesh.Trimesh:
     """A watertight mesh around the Gaussians of one part, in their frame and unit, with a colour per vertex.
 
-    The part alone is rendered from all around. Space that several views see through is empty; all else is solid: what
-    no view can look into is closed, and a sheet that both sides are seen of has some thickness. Where the part has no
-    Gaussians because others always stood before it, as on the face that one lies on, or because no camera looked there,
-    as at an underside, views do not see through a convex body about it. A part too small or too transparent to hide
-    what is behind it becomes the convex hull of its Gaussians. Deterministic.
+    The part alone is rendered from all around, and from where cameras were. Space that several views see through is
+    empty; all else is solid: what no view can look into is closed, and a sheet that both sides are seen of has some
+    thickness. Where the part has no Gaussians because others always stood before it, as on the face that one lies on,
+    or because no camera looked there, as at an underside, views do not see through a convex body about it. A part too
+    small or too transparent to hide what is behind it becomes the convex hull of its Gaussians. Deterministic.
 
     Args:
         splat: The Gaussians [N].

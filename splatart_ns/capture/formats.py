@@ -305,7 +305,7 @@ def _frame(file: Path, root: Path, name: str, meta: dict[str, Any], entry: dict[
 
     image = inner_path(file, root, f"file_path of {owner}", name)
     own = own_before(entry, meta)
-    unit = own.get("depth_unit_scale_factor")
+    unit = own.get("depth_unit_scale_factor", Frame.depth_unit)
     return Frame(
         name=name,
         image=image,
@@ -316,9 +316,7 @@ def _frame(file: Path, root: Path, name: str, meta: dict[str, Any], entry: dict[
         object_mask=optional("object_mask_path"),
         mask=optional("mask_path"),
         depth=optional("depth_file_path"),
-        depth_unit=Frame.depth_unit
-        if unit is None
-        else parse_positive(file, f"depth_unit_scale_factor of {owner}", unit),
+        depth_unit=parse_positive(file, f"depth_unit_scale_factor of {owner}", unit),
     )
 
 

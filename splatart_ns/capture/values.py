@@ -134,10 +134,10 @@ def show(value: Any) -> str:
 
 def own_before(entry: dict[str, Any], meta: dict[str, Any]) -> dict[str, Any]:
     """A frame's own values, and those of its file that they do not replace: a focal length of its own replaces both, in
-    either form, and so does a distortion."""
-    given = {key: value for key, value in entry.items() if value is not None}
-    replaced = {key for group in _TOGETHER if group & given.keys() for key in group}
-    return {key: value for key, value in meta.items() if key not in replaced} | given
+    either form, and so does a distortion. Null is none."""
+    own, of_file = ({key: value for key, value in of.items() if value is not None} for of in (entry, meta))
+    replaced = {key for group in _TOGETHER if group & own.keys() for key in group}
+    return {key: value for key, value in of_file.items() if key not in replaced} | own
 
 
 def parse_camera(file: Path, owner: str, values: dict[str, Any], image: Path) -> Camera:

@@ -6,6 +6,7 @@ import torch
 import trimesh
 from solid_splat import splat_on
 
+from splatart_ns.bundle.depth_view import look_around
 from splatart_ns.bundle.surface import part_surface
 from splatart_ns.errors import InputError
 from splatart_ns.splats.splat import Splat
@@ -249,6 +250,14 @@ def test_a_deep_hollow_is_open_as_far_as_cameras_looked_into_it():
     assert mesh.volume < 0.35 * 0.8 * 0.6 * 2.0
     x, y, z = mesh.vertices.T
     assert z[(np.abs(x) < 0.25) & (np.abs(y) < 0.18)].max() == pytest.approx(-1.0, abs=0.1)
+
+
+def test_a_camera_in_the_very_middle_looks_from_no_side():
+    box, centre = splat_on(trimesh.creation.box((1, 0.6, 0.4)), 500), torch.zeros(3, dtype=torch.float64)
+    towards = torch.tensor([[0, 0, 0], [0, 0.6, 0.8]], dtype=torch.float64)
+    views = [look_around(box, centre, 1.0, 32, towards=some) for some in (None, towards[:1], towards)]
+    assert [len(some) - len(views[0]) for some in views] == [0, 0, 1]
+    assert all(view.image.isfinite().all() for view in views[2])
 
 
 def test_a_hollow_stays_that_another_part_uncovers_in_some_state():
