@@ -32,12 +32,12 @@ from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.flush import border_against_others
 from splatart_ns.stages.image_error import image_error
+from splatart_ns.stages.initial_motion import InitialMotion, initial_motion
 from splatart_ns.stages.merge import merge_parts
 from splatart_ns.stages.neighbours import turned_as_neighbours_let
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.pose_notes import doubtful_rest, ill_shown, open_turns, turns_alike, unknown_poses
 from splatart_ns.stages.reference import is_sure, reference_states, refine_known_poses, since_state_0
-from splatart_ns.stages.render_choice import InitialMotion, initial_motion
 from splatart_ns.stages.shared_labels import share_labels
 from splatart_ns.stages.siblings import slid_alike, slide_ways
 from splatart_ns.stages.silhouette import with_rendered_labels

@@ -19,8 +19,9 @@ from splatart_ns.geometry.screw import screw_from_motion
 from splatart_ns.geometry.se3 import from_rotation_translation, inverse, so3_log
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.contact import Contact, find_contacts
+from splatart_ns.stages.initial_motion import InitialMotion
 from splatart_ns.stages.motion_preference import SLIDE_TURN, TURNED_OVER
-from splatart_ns.stages.render_choice import InitialMotion, alike_in_even_light
+from splatart_ns.stages.render_choice import alike_in_even_light
 from splatart_ns.stages.symmetric_turns import symmetric_turns
 
 TOUCHING, NO_NEARER = 0.03, 1.5

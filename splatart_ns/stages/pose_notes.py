@@ -14,8 +14,8 @@ from torch import Tensor
 
 from splatart_ns.geometry.se3 import inverse, so3_log
 from splatart_ns.stages.image_error import ImageError
+from splatart_ns.stages.initial_motion import InitialMotion
 from splatart_ns.stages.motion_preference import OTHERWISE
-from splatart_ns.stages.render_choice import InitialMotion
 from splatart_ns.stages.unseen import may_have_turned, unturned
 
 FEW = 4

@@ -74,7 +74,7 @@ def register(source: PartPoints, target: PartPoints, seed: int = 0) -> np.ndarra
     """Candidates for the motion of a part [C, 4, 4], which differ by 6 degrees or 6 % of the radius or more.
 
     Best fit first: the trimmed mean distance, both ways, of points and colours. Flat parts fit alike when turned over,
-    so this ranks candidates but must not choose among them (see render_choice).
+    so this ranks candidates but must not choose among them (see initial_motion).
 
     Starts: no motion, centroid on centroid with no turn, with the four proper alignments of the principal axes, and
     with random turns. All starts are followed together, once for each of `TRIMS`, and the `FOLLOWED` best to the end;

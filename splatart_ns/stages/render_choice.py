@@ -1,4 +1,4 @@
-"""Initial motions of all parts: registration proposes, renderings into the other state's views choose."""
+"""Which of several proposed motions of a part is right: renderings into the views of the other state tell."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from splatart_ns.stages.motion_preference import (
     HALF_TURN,
     OTHERWISE,
     SIMILAR_TURN,
-    SUSPECT,
     TURNED_OVER,
     looks_alike,
     prefer_less_turn,
@@ -30,7 +29,7 @@ from splatart_ns.stages.motion_preference import (
 )
 from splatart_ns.stages.part_pair import IN_EVEN_LIGHT, PartPair, part_pair
 from splatart_ns.stages.refinement import Refinement, increment, refine, shifted
-from splatart_ns.stages.registration import MIN_POINTS, distinct, part_points, point_to_plane, register
+from splatart_ns.stages.registration import distinct
 from splatart_ns.stages.shading import without_shading
 from splatart_ns.stages.symmetric_turns import symmetric_turns
 
@@ -41,183 +40,121 @@ DOUBTFUL_VIEWS = 12
 COARSE_PIXELS = 1500
 """Choosing needs no more pixels a view than this."""
 TINY_PIXELS = 400
-"""Searching widely needs no more than this."""
-GLANCE_VIEWS = 2
-"""Views of each state, of so few pixels, that tell hopeless candidates."""
+"""A glance, and searching widely, need no more than this."""
 HOPELESS = 4.0
-"""These cost more than this many times the best."""
+"""Candidates that at a glance cost more than this many times the best are not looked at again."""
 FINE_PIXELS = 10000
 """Refining needs as many; coarse images would bias it."""
 COARSE_STEPS, FINE_STEPS = 5, 10
 """Iterations of a refinement on few pixels, which only brings near, and on many."""
 SIMILAR = 2.5
 """Candidates that cost more than this many times the best are dropped before refining."""
-OTHERS = 2
-"""So many of these are kept beside the best."""
+REFINED_SIMILAR = 1.5
+"""Once refined on few pixels, those that cost more than this many times the best are not refined on many."""
+KEPT, OTHERS = 3, 2
+"""So many of the best are kept, and beside them so many that turn the part quite otherwise."""
+WIDE_STARTS = 5
+"""A wide search starts from so many."""
 EXPLAINED = 1.8
-"""Of such a part a motion that fits the images of one state at most this many times worse than that state's own
-Gaussians is preferred to what fits them as many times worse than it. Right ones measured 0.4 to 1.2 in one of the
-states (22 of 25), a wrong one 4."""
+"""Of a part of which one state hides most, a motion that fits the images of one state at most this many times worse
+than that state's own Gaussians is preferred to what fits them as many times worse than it. Right ones measured 0.4 to
+1.2 in one of the states (22 of 25), a wrong one 4."""
 ENOUGH = 0.2
 """If that state shows at least this share of the part's pixels."""
 SEARCH_STEPS = (0.6, 0.3, 0.15, 0.08)
-"""Steps of that search: part radii, and radians."""
-STILL_RATIO = 1.2
-"""A part whose images fit no motion worse than this many times the best motion did not move."""
-RESTS_RATIO = 1.05
-"""Whether it did is in doubt where they fit worse than this: parts that rest measured 1.003 to 1.035 (one each of 12
-objects), wheels, knobs and a turntable that turned, of which much is hidden, 1.06 to 1.14 (six of two)."""
-SHADED_RATIO = 2.0
-"""Nor one that fits no motion worse than this and would have turned far, if in even light it fits as well unmoved: what
-moved beside it shades it otherwise."""
+"""Steps of a wide search: part radii, and radians."""
 
 
 @dataclass(frozen=True)
-class InitialMotion:
-    """A part's motion from state 0 to another state, before the poses of all parts are refined together."""
+class PartLook:
+    """One part in two states at few pixels, which bring near, and at many, which refine and rank."""
 
-    T: Tensor
-    """[4, 4] float64."""
-    found: bool
-    """False when the part has too few Gaussians in one of the states; T is then the identity."""
-    still: bool = False
-    """Whether the part did not move; T is then the identity."""
-    cost: float = float("nan")
-    """Mean Huber cost per pixel of the part (see part_pair)."""
-    identity_ratio: float = float("nan")
-    """Cost of no motion over the best cost."""
-    alike: tuple[Tensor, ...] = ()
-    """Motions [4, 4] that turn the part quite otherwise and render as well, the best first."""
-    maybe_moved: bool = False
-    """Whether another motion fits a still part somewhat better."""
+    coarse: PartPair
+    fine: PartPair
+
+    def shown_by(self, state: int) -> PartLook:
+        """The look at the images of one state alone (see `PartPair.shown_by`)."""
+        return PartLook(self.coarse.shown_by(state), self.fine.shown_by(state))
+
+    def unmoved_cost(self) -> float:
+        """What it costs that the part did not move."""
+        return float(self.fine.cost(torch.eye(4).to(self.fine.centroid)[None])[0])
 
 
-def initial_motion(
-    splats: tuple[Splat, Splat],
-    views: tuple[Sequence[View], Sequence[View]],
-    seen: tuple[Tensor, Tensor],
-    part: int,
-    seed: int = 0,
-) -> InitialMotion:
-    """The motion of one part between two states.
-
-    Args:
-        splats: The labelled splats of the one and the other state.
-        views: Their training views.
-        seen: The `visibility` of each state's Gaussians.
-    """
-    source, target = (part_points(s, v, part) for s, v in zip(splats, seen, strict=True))
-    identity = torch.eye(4, dtype=torch.float64, device=splats[0].means.device)
-    if min(len(source.xyz), len(target.xyz)) < MIN_POINTS:
-        return InitialMotion(identity, found=False)
-    coarse = part_pair(splats, views, part, VIEWS, COARSE_PIXELS)
-    fine = part_pair(splats, views, part, VIEWS, FINE_PIXELS)
-    if fine is not None:
-        own_cost, identity_cost = fine.own_cost(), float(fine.cost(identity[None])[0])
-        if identity_cost < STILL_RATIO * own_cost:  # no motion fits much better than a state's own Gaussians
-            return InitialMotion(identity, found=True, still=True, cost=identity_cost, identity_ratio=1.0)
-    registered = torch.from_numpy(register(source, target, seed)).to(identity)
-    if coarse is None or fine is None:
-        return InitialMotion(registered[0], found=True)
-    tiny = part_pair(splats, views, part, GLANCE_VIEWS, TINY_PIXELS)
-    proposed = torch.cat([identity[None], registered])
-    glance = appearance_cost(tiny, proposed)
-    hopeful = proposed[torch.from_numpy(glance <= HOPELESS * glance.min())]
-    closer = torch.from_numpy(point_to_plane(source, target, hopeful.numpy(force=True))).to(identity)
-    everything, candidates = torch.cat([proposed, closer]), torch.cat([hopeful, closer])
-    chosen = choose(coarse, candidates, SIMILAR)
-    if float(coarse.cost(identity[None])[0]) < STILL_RATIO * float(coarse.cost(chosen[:1])[0]):
-        chosen = identity[None]
-    ends = refined(coarse, fine, chosen)
-    if min(e.cost for e in ends) > SUSPECT * own_cost:
-        ends += searched_widely(part_pair(splats, views, part, 3, TINY_PIXELS), coarse, fine, everything)
-    T, cost, order = ranked(fine, ends)
-    state = None
-    if ends[order[0]].cost > SUSPECT * own_cost:
-        state, ends = explained_by_one_state(coarse, fine, everything, ends, order[0])
-    if state is not None:
-        coarse, fine = coarse.shown_by(state), fine.shown_by(state)
-        identity_cost = float(fine.cost(identity[None])[0])
-        T, cost, order = ranked(fine, ends)
-    moved = identity_cost >= STILL_RATIO * ends[order[0]].cost
-    doubtful = in_doubt(tiny, coarse, fine, T, cost, order, moved)
-    if len(doubtful):
-        coarse, fine = (part_pair(splats, views, part, DOUBTFUL_VIEWS, n) for n in (COARSE_PIXELS, FINE_PIXELS))
-        if state is not None:
-            coarse, fine = coarse.shown_by(state), fine.shown_by(state)
-        identity_cost = float(fine.cost(identity[None])[0])
-        ends = refined(coarse, fine, choose(coarse, torch.cat([doubtful, candidates]), SIMILAR))
-        T, cost, order = ranked(fine, ends)
-    best = ends[order[0]]
-    identity_ratio = identity_cost / max(best.cost, 1e-12)
-    still = identity_ratio < STILL_RATIO
-    least = min(end.cost for end in ends)  # the preferred one may cost more, and says nothing of rest
-    if not still and identity_cost < SHADED_RATIO * least and so3_log(best.T[:3, :3]).norm() > OTHERWISE / 2:
-        even = part_pair(splats, views, part, DOUBTFUL_VIEWS, FINE_PIXELS)
-        stayed, turned = replace(even, **IN_EVEN_LIGHT).cost(torch.stack([identity, best.T])).tolist()
-        still = stayed < STILL_RATIO * turned
-    maybe_moved = still and identity_ratio > RESTS_RATIO
-    own = own_appearance(fine)
-    alike = () if still else tuple(ends[i].T for i in order if looks_alike(T, cost, order[0], i, own))
-    return InitialMotion(
-        identity if still else best.T,
-        found=True,
-        still=still,
-        cost=best.cost,
-        identity_ratio=identity_ratio,
-        alike=alike,
-        maybe_moved=maybe_moved,
-    )
+def part_look(
+    splats: tuple[Splat, Splat], views: tuple[Sequence[View], Sequence[View]], part: int, num_views: int
+) -> PartLook | None:
+    """A look at a part in up to `num_views` views of each state; None where there is no `part_pair`."""
+    coarse, fine = (part_pair(splats, views, part, num_views, pixels) for pixels in (COARSE_PIXELS, FINE_PIXELS))
+    return None if coarse is None or fine is None else PartLook(coarse, fine)
 
 
-def searched_widely(small: PartPair, coarse: PartPair, fine: PartPair, candidates: Tensor) -> list[Refinement]:
+@dataclass(frozen=True)
+class Ranking:
+    """Refined motions in the order in which they are preferred."""
+
+    ends: Sequence[Refinement]
+    T: np.ndarray
+    """Theirs [C, 4, 4]."""
+    cost: np.ndarray
+    """Their `appearance_cost` [C]."""
+    order: list[int]
+    """The distinct ones, the preferred first."""
+    own: float
+    """The `own_appearance` of the pair by which they are ranked."""
+
+    @property
+    def best(self) -> Refinement:
+        return self.ends[self.order[0]]
+
+    def alike(self, times: float = ALIKE) -> list[Tensor]:
+        """Those [4, 4] that turn the part quite otherwise than the best and render as well (see `looks_alike`)."""
+        best = self.order[0]
+        return [self.ends[i].T for i in self.order if looks_alike(self.T, self.cost, best, i, self.own, times)]
+
+
+def searched_widely(small: PartPair, look: PartLook, candidates: Tensor) -> list[Refinement]:
     """What compass searches from the most hopeful of `candidates` [C, 4, 4], on few pixels, end in, refined."""
-    wide = torch.stack([search(small, T) for T in choose(coarse, candidates, float("inf"), keep=5)])
-    return [refine(fine, T, FINE_STEPS) for T in choose(coarse, wide, 1.5)]
+    starts = choose(look.coarse, candidates, float("inf"), keep=WIDE_STARTS)
+    found = torch.stack([search(small, T) for T in starts])
+    return [refine(look.fine, T, FINE_STEPS) for T in choose(look.coarse, found, REFINED_SIMILAR)]
 
 
-def in_doubt(
-    tiny: PartPair, coarse: PartPair, fine: PartPair, T: np.ndarray, cost: np.ndarray, order: list[int], moved: bool
-) -> Tensor:
-    """Motions [K, 4, 4] among which more views must choose: those of T [C, 4, 4], `ranked` by cost [C] and order, and
-    what `turned_alike` finds. None where the first of them, or that the part did not move, is beyond doubt."""
-    known = torch.from_numpy(T[order]).to(fine.centroid.device)
-    turned = turned_alike(tiny, coarse, known[0]) if moved else known[:0]
+def in_doubt(glance: PartPair, coarse: PartPair, ranking: Ranking, moved: bool) -> Tensor:
+    """Motions [K, 4, 4] among which more views must choose: those ranked, and what `turned_alike` finds. None where the
+    best of them, or that the part did not move, is beyond doubt."""
+    known = torch.stack([ranking.ends[i].T for i in ranking.order])
+    turned = turned_alike(glance, coarse, known[0]) if moved else known[:0]
     times = DOUBTFUL if so3_log(known[0, :3, :3]).norm() > TURNED_OVER else ALIKE
-    own = own_appearance(fine)
-    if len(turned) or moved and any(looks_alike(T, cost, order[0], i, own, times) for i in order):
-        return torch.cat([known, turned])
-    return known[:0]
+    return torch.cat([known, turned]) if len(turned) or moved and ranking.alike(times) else known[:0]
 
 
-def explained_by_one_state(
-    coarse: PartPair, fine: PartPair, candidates: Tensor, ends: Sequence[Refinement], best: int
-) -> tuple[int | None, Sequence[Refinement]]:
-    """The state whose images a motion explains that the best of `ends` does not, and that motion with its rivals.
+def explained_by_one_state(look: PartLook, candidates: Tensor, best: Refinement) -> tuple[int, list[Refinement]] | None:
+    """The state whose images a motion explains that the `best` one does not, and that motion with its rivals.
 
     A drawer that is shut in one state shows nothing but its front there: moved to where the other state shows all of
     it, it misses most of that, and may miss less if it is turned so as to cover it. Moved the other way, all that is
-    seen is there. None, and `ends`, where no motion explains the images of a state.
+    seen is there. None where no motion explains the images of a state.
     """
     for state in (0, 1):
-        few, many = coarse.shown_by(state), fine.shown_by(state)
-        if many.area < ENOUGH * fine.area:
+        one = look.shown_by(state)
+        if one.fine.area < ENOUGH * look.fine.area:
             continue
-        rivals = refined(few, many, choose(few, candidates, SIMILAR))
+        rivals = refined(one, choose(one.coarse, candidates, SIMILAR))
         least = min(end.cost for end in rivals)
-        if least < EXPLAINED * many.own_cost() and float(many.cost(ends[best].T[None])[0]) > EXPLAINED * least:
+        if least < EXPLAINED * one.fine.own_cost() and float(one.fine.cost(best.T[None])[0]) > EXPLAINED * least:
             return state, rivals
-    return None, ends
+    return None
 
 
-def turned_alike(tiny: PartPair, coarse: PartPair, T: Tensor) -> Tensor:
+def turned_alike(glance: PartPair, coarse: PartPair, T: Tensor) -> Tensor:
     """Motions [K, 4, 4] quite other than T [4, 4] that a symmetric part, turned so that it looks alike, may have made.
 
     Registration may have missed the right one of them.
     """
     R, centroid = symmetric_turns(coarse.splats[0]), coarse.centroid
     turned = torch.cat([T[None], T @ from_rotation_translation(R, centroid - R @ centroid)])
-    cost = appearance_cost(tiny, turned)
+    cost = appearance_cost(glance, turned)
     turned = turned[1:][torch.from_numpy(cost[1:] <= HOPELESS * cost[0])]
     if len(turned) == 0:
         return turned
@@ -254,19 +191,20 @@ def alike_in_even_light(
     return [end.T for end in sorted(ends, key=lambda end: end.cost) if end.cost < limit]
 
 
-def refined(coarse: PartPair, fine: PartPair, candidates: Tensor) -> list[Refinement]:
+def refined(look: PartLook, candidates: Tensor) -> list[Refinement]:
     """The motions [C, 4, 4] refined on many pixels, of several those that render best once refined on few.
 
     If the best turns the part over, `mere_shifts` come last, for `prefer_slide`.
     """
     if len(candidates) > 1:
-        near = [refine(coarse, T, COARSE_STEPS) for T in candidates]
+        near = [refine(look.coarse, T, COARSE_STEPS) for T in candidates]
         least = min(near, key=lambda end: end.cost)
         half_turn = so3_log(least.T[:3, :3]).norm() > HALF_TURN  # to which `prefer_less_turn` may prefer dearer ones
-        times = DOUBTFUL if half_turn else 1.5
-        candidates = choose(coarse, torch.stack([end.T for end in near]), times, own=own_appearance(coarse))
-    ends = [refine(fine, T, FINE_STEPS) for T in candidates]
-    return [*ends, *mere_shifts(fine, ends)]
+        times = DOUBTFUL if half_turn else REFINED_SIMILAR
+        nearer = torch.stack([end.T for end in near])
+        candidates = choose(look.coarse, nearer, times, own=own_appearance(look.coarse))
+    ends = [refine(look.fine, T, FINE_STEPS) for T in candidates]
+    return [*ends, *mere_shifts(look.fine, ends)]
 
 
 def mere_shifts(pair: PartPair, ends: Sequence[Refinement]) -> list[Refinement]:
@@ -283,15 +221,15 @@ def mere_shifts(pair: PartPair, ends: Sequence[Refinement]) -> list[Refinement]:
     return [shifted(pair, ends[i].T) for i in dict.fromkeys((best, straightest))]
 
 
-def ranked(pair: PartPair, ends: Sequence[Refinement]) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Motions [C, 4, 4], what they cost [C], and the distinct ones of them in the order in which they are preferred."""
+def ranked(pair: PartPair, ends: Sequence[Refinement]) -> Ranking:
+    """Refined motions by what they cost, and by what parts of objects do (see `motion_preference`)."""
     T = torch.stack([e.T for e in ends])
     cost, T = appearance_cost(pair, T), T.cpu().numpy()
     order = distinct(T, cost, pair.centroid.cpu().numpy(), pair.radius)
     own = own_appearance(pair)
     upright = cost[order[0]] < AS_WELL * own and prefer_upright(T, cost, order)
     order = upright or prefer_slide(T, cost, order, own)
-    return T, cost, prefer_less_turn(T, cost, prefer_turn(T, cost, order, pair.radius))
+    return Ranking(ends, T, cost, prefer_less_turn(T, cost, prefer_turn(T, cost, order, pair.radius)), own)
 
 
 def search(pair: PartPair, T: Tensor) -> Tensor:
@@ -325,7 +263,7 @@ def own_appearance(pair: PartPair) -> float:
     return 0.5 * (pair.own_cost() + without_shading(pair).own_cost())
 
 
-def choose(pair: PartPair, candidates: Tensor, similar: float, keep: int = 3, own: float = 0.0) -> Tensor:
+def choose(pair: PartPair, candidates: Tensor, similar: float, keep: int = KEPT, own: float = 0.0) -> Tensor:
     """The distinct motions [K, 4, 4] among `candidates` [C, 4, 4] that render best, best first.
 
     At most `keep`, and a few that turn the part quite otherwise: those may be one motion found several times. None

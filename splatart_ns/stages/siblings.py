@@ -16,6 +16,7 @@ from torch import Tensor
 from splatart_ns.capture.view import View
 from splatart_ns.geometry.se3 import so3_log, transform_points
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.initial_motion import InitialMotion
 from splatart_ns.stages.motion_preference import ALIKE, SLIDE_TURN, TURNED_OVER, looks_alike
 from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.refinement import shifted
@@ -24,7 +25,6 @@ from splatart_ns.stages.render_choice import (
     DOUBTFUL_VIEWS,
     FINE_PIXELS,
     VIEWS,
-    InitialMotion,
     appearance_cost,
 )
 

@@ -18,12 +18,13 @@ from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.flush import is_flush
 from splatart_ns.stages.free_space import FreeSpace, without_haze
+from splatart_ns.stages.initial_motion import initial_motion
 from splatart_ns.stages.motion_preference import OTHERWISE, SUSPECT
 from splatart_ns.stages.part_pair import IN_EVEN_LIGHT, part_pair
 from splatart_ns.stages.pose_evidence import ALL_VIEWS, MAX_ITERATIONS
 from splatart_ns.stages.refinement import motion_covariance, refine
 from splatart_ns.stages.registration import COLOUR, MIN_POINTS, PartPoints, part_points
-from splatart_ns.stages.render_choice import COARSE_PIXELS, DOUBTFUL_VIEWS, FINE_PIXELS, VIEWS, initial_motion
+from splatart_ns.stages.render_choice import COARSE_PIXELS, DOUBTFUL_VIEWS, FINE_PIXELS, VIEWS
 from splatart_ns.stages.visibility import shown_of_parts
 
 ALIKE = 1.05

@@ -15,7 +15,7 @@ from splatart_ns.geometry.se3 import se3_exp, so3_log
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.plugin.pose import MOST, RATES
 from splatart_ns.plugin.semantic_run import read_state
-from splatart_ns.stages.render_choice import InitialMotion
+from splatart_ns.stages.initial_motion import InitialMotion
 from splatart_ns.stages.thinning import BUDGET, LARGEST_SHARE, ROUNDS
 from splatart_ns.stages.world import WorldFit
 

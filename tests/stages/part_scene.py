@@ -136,4 +136,31 @@ def nearby(T: torch.Tensor, size: float, seed: int = 0) -> torch.Tensor:
     return se3_exp(size * torch.randn(6, generator=g, dtype=torch.float64)) @ T
 
 
-__all__ = ["NUM_PARTS", "angle_deg", "box", "disc", "inverse", "motion", "nearby", "photograph", "two_states"]
+OPENED = motion((60, 0, 0), (0.0, 0.1, 0.3))
+
+
+def lit_lid(colour):
+    """Opened it is lit from below, so that it fits better turned over, though its sides differ by twice a colour."""
+    lid = box(1, (0.6, 0.4, 0.06), (0.0, 0.0, 0.0), spacing=0.04)
+    above, front = lid.means[:, 2, None, None] > 0, lid.means[:, 1, None, None] > 0.1
+    colours = torch.where(above, colour, -colour) * torch.tensor([1.0, -0.5, -0.5])
+    colours = colours + torch.where(front, 0.4, 0.0) * torch.tensor([-0.5, 1.0, -0.5])
+    opened = lid.transformed(OPENED)
+    lid.sh, opened.sh = (torch.where(lit, 0.5, -0.1) + colours for lit in (above, ~above))
+    splats = lid, opened
+    return splats, tuple(photograph(s, count=20) for s in splats)
+
+
+__all__ = [
+    "NUM_PARTS",
+    "OPENED",
+    "angle_deg",
+    "box",
+    "disc",
+    "inverse",
+    "lit_lid",
+    "motion",
+    "nearby",
+    "photograph",
+    "two_states",
+]

@@ -3,9 +3,9 @@ import torch
 from part_scene import angle_deg, box, motion, photograph, two_states
 
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.initial_motion import InitialMotion
 from splatart_ns.stages.neighbours import turned_as_neighbours_let
 from splatart_ns.stages.part_pair import PartPair
-from splatart_ns.stages.render_choice import InitialMotion
 
 EYE = torch.eye(4, dtype=torch.float64)
 RESTS = InitialMotion(EYE, found=True, still=True)

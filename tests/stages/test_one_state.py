@@ -7,13 +7,12 @@ import torch
 from part_scene import angle_deg, box, motion, photograph
 
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.initial_motion import initial_motion
 from splatart_ns.stages.motion_preference import SUSPECT
-from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.render_choice import (
-    COARSE_PIXELS,
-    FINE_PIXELS,
+    PartLook,
     explained_by_one_state,
-    initial_motion,
+    part_look,
     ranked,
     refined,
 )
@@ -48,64 +47,53 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def pairs(scene):
+def look(scene):
     splats, views, _ = scene
-    return tuple(part_pair(splats, views, 2, 5, pixels) for pixels in (COARSE_PIXELS, FINE_PIXELS))
+    return part_look(splats, views, 2, 5)
 
 
 @pytest.fixture(scope="module")
-def ends(pairs):
+def covering(look):
     """Where refinement ends that looks at the images of both states."""
-    return refined(*pairs, torch.stack([PULLED, COVERING]))
+    return ranked(look.fine, refined(look, torch.stack([PULLED, COVERING]))).best
 
 
-def best_of(pair, ends):
-    order = ranked(pair, ends)[2]
-    return ends[order[0]], order[0]
-
-
-def test_the_shut_state_tells_that_a_drawer_slid_which_seems_turned_so_as_to_cover_what_came_to_light(pairs, ends):
-    covering, best = best_of(pairs[1], ends)
+def test_the_shut_state_tells_that_a_drawer_slid_which_seems_turned_so_as_to_cover_what_came_to_light(look, covering):
     assert angle_deg(covering.T, PULLED) > 20
-    assert covering.cost > SUSPECT * pairs[1].own_cost()
-    state, rivals = explained_by_one_state(*pairs, torch.stack([PULLED, COVERING]), ends, best)
+    assert covering.cost > SUSPECT * look.fine.own_cost()
+    state, rivals = explained_by_one_state(look, torch.stack([PULLED, COVERING]), covering)
     assert state == 0
-    slid, _ = best_of(pairs[1].shown_by(0), rivals)
+    slid = ranked(look.fine.shown_by(0), rivals).best
     assert angle_deg(slid.T, PULLED) < 5
     assert torch.allclose(slid.T[:3, 3], PULLED[:3, 3], atol=0.06)
 
 
 def test_the_shut_state_tells_it_where_it_is_the_second_one_too(scene):
     splats, views, _ = (x[::-1] for x in scene)
-    pairs = tuple(part_pair(splats, views, 2, 5, pixels) for pixels in (COARSE_PIXELS, FINE_PIXELS))
+    look = part_look(splats, views, 2, 5)
     pushed = torch.stack([torch.linalg.inv(PULLED), torch.linalg.inv(COVERING)])
-    ends = refined(*pairs, pushed)
-    assert explained_by_one_state(*pairs, pushed, ends, best_of(pairs[1], ends)[1])[0] == 1
+    assert explained_by_one_state(look, pushed, ranked(look.fine, refined(look, pushed)).best)[0] == 1
 
 
-def test_what_explains_no_state_is_not_preferred(pairs, ends):
-    far = motion((0, 0, 90), (0.5, 0.5, 0))[None]
-    assert explained_by_one_state(*pairs, far, ends, best_of(pairs[1], ends)[1]) == (None, ends)
+def test_what_explains_no_state_is_not_preferred(look, covering):
+    assert explained_by_one_state(look, motion((0, 0, 90), (0.5, 0.5, 0))[None], covering) is None
 
 
-def test_a_motion_that_explains_the_shut_state_as_well_stays(pairs):
-    slid = refined(*(pair.shown_by(0) for pair in pairs), PULLED[None])
-    candidates = torch.stack([PULLED, COVERING])
-    assert explained_by_one_state(*pairs, candidates, slid, 0) == (None, slid)
+def test_a_motion_that_explains_the_shut_state_as_well_stays(look):
+    slid = refined(look.shown_by(0), PULLED[None])[0]
+    assert explained_by_one_state(look, torch.stack([PULLED, COVERING]), slid) is None
 
 
-def test_a_state_that_shows_next_to_nothing_of_the_part_tells_nothing(pairs, ends):
-    coarse, fine = pairs
-    sliver = tuple(replace(view, area=0.1 * view.area) for view in fine.views[0])
-    fine = replace(fine, views=(sliver, fine.views[1]))
-    candidates = torch.stack([PULLED, COVERING])
-    assert explained_by_one_state(coarse, fine, candidates, ends, best_of(fine, ends)[1]) == (None, ends)
+def test_a_state_that_shows_next_to_nothing_of_the_part_tells_nothing(look, covering):
+    sliver = tuple(replace(view, area=0.1 * view.area) for view in look.fine.views[0])
+    fine = replace(look.fine, views=(sliver, look.fine.views[1]))
+    assert explained_by_one_state(PartLook(look.coarse, fine), torch.stack([PULLED, COVERING]), covering) is None
 
 
-def test_a_pulled_drawer_is_found_by_what_the_shut_state_shows(scene, pairs):
+def test_a_pulled_drawer_is_found_by_what_the_shut_state_shows(scene, look):
     found = initial_motion(*scene, part=2)
     assert found.found and not found.still
     assert angle_deg(found.T, PULLED) < 5
-    both = float(pairs[1].cost(found.T[None])[0])
+    both = float(look.fine.cost(found.T[None])[0])
     assert found.cost < 0.3 * both
-    assert found.cost == pytest.approx(float(pairs[1].shown_by(0).cost(found.T[None])[0]), rel=0.5)
+    assert found.cost == pytest.approx(float(look.fine.shown_by(0).cost(found.T[None])[0]), rel=0.5)

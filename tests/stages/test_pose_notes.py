@@ -5,8 +5,8 @@ import torch
 
 from splatart_ns.geometry.se3 import se3_exp
 from splatart_ns.stages.image_error import ImageError
+from splatart_ns.stages.initial_motion import InitialMotion
 from splatart_ns.stages.pose_notes import doubtful_rest, ill_shown, open_turns, turns_alike, unknown_poses
-from splatart_ns.stages.render_choice import InitialMotion
 
 NAMES = ["base", "lid"]
 

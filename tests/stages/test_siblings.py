@@ -6,8 +6,9 @@ from part_scene import box, motion, two_states
 
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages.initial_motion import InitialMotion
 from splatart_ns.stages.part_pair import part_pair
-from splatart_ns.stages.render_choice import FINE_PIXELS, VIEWS, InitialMotion, appearance_cost
+from splatart_ns.stages.render_choice import FINE_PIXELS, VIEWS, appearance_cost
 from splatart_ns.stages.siblings import slid_alike, slide_ways
 
 SLID = motion((0, 0, 0), (0.45, 0.0, 0.0))

@@ -9,7 +9,7 @@ from splatart_ns.geometry.se3 import transform_points
 from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_of, similarity
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import world
-from splatart_ns.stages.render_choice import initial_motion
+from splatart_ns.stages.initial_motion import initial_motion
 from splatart_ns.stages.visibility import visibility
 from splatart_ns.stages.world import (
     WorldFit,
