@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 import threading
 import time
@@ -22,6 +21,11 @@ from splatart_ns.plugin.companion import Companion, Companions, Outcome
 from splatart_ns.plugin.compat import seed_everything, stop_event_writers
 from splatart_ns.rasterize.rasterization import default_device
 from splatart_ns.threads import kernel_threads
+
+try:
+    import resource
+except ImportError:  # not on Windows
+    resource = None
 
 
 def run_stage(config: TrainerConfig, on_step: Callable[[int], None]) -> Outcome:
@@ -119,9 +123,11 @@ def run_side_by_side(
                     following += 1
 
 
-def _peak_memory_mb() -> int:
-    """Of the GPU in this stage where there is one, else of this process so far."""
+def _peak_memory_mb() -> int | None:
+    """Of the GPU in this stage where there is one, else of this process so far; unknown on Windows."""
     if default_device() == "cuda":
         return torch.cuda.max_memory_allocated() // 2**20
+    if resource is None:
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak // (2**20 if sys.platform == "darwin" else 2**10)

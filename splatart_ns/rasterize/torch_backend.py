@@ -72,27 +72,27 @@ class _Rasterize(torch.autograd.Function):
         grid = Grid(width, height)
         keep_steps = any(ctx.needs_input_grad[:4])
         kept_bytes = KEPT_BYTES // max(len(means2d), 1)
-        views, images, alphas = [], [], []
-        for view in zip(means2d, conics, opacities, colors, depths, visible, strict=True):
+        image = colors.new_empty(len(colors), height, width, colors.shape[-1])
+        alpha = image.new_empty(*image.shape[:-1], 1)
+        views = []
+        for c, view in enumerate(zip(means2d, conics, opacities, colors, depths, visible, strict=True)):
             pairs = Pairs.find(*view, grid)
             values, steps = _composite(pairs, keep_steps, kept_bytes)
-            images.append(grid.image(pairs.tiles, values[:, :-1]))
-            alphas.append(grid.image(pairs.tiles, values[:, -1:]))
+            image[c], alpha[c] = (grid.image(pairs.tiles, v) for v in (values[:, :-1], values[:, -1:]))
             views.append((pairs, steps))
         ctx.save_for_backward(means2d, opacities)
         ctx.grid, ctx.views, ctx.absgrad = grid, views, absgrad
-        return torch.stack(images), torch.stack(alphas)
+        return image, alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_image, v_alpha):
         means2d, opacities = ctx.saved_tensors
-        N, D = opacities.shape[1], v_image.shape[-1]
-        gradients = []
+        (C, N), D = opacities.shape, v_image.shape[-1]
+        moments = v_image.new_empty(C, N, 7 + D + 2 * ctx.absgrad)
         for c, (pairs, steps) in enumerate(ctx.views):
             v_values = torch.cat([ctx.grid.values(pairs.tiles, v[c]) for v in (v_image, v_alpha)], 1)
-            gradients.append(_backward(pairs, steps, v_values, N, ctx.absgrad))
-        moments = torch.stack(gradients)
+            moments[c] = _backward(pairs, steps, v_values, N, ctx.absgrad)
         v_conics = moments[..., :3] * moments.new_tensor([-0.5, -1.0, -0.5])
         v_log = moments[..., 5]
         v_opacities = (v_log / opacities).where(v_log != 0, 0.0)  # what is not drawn may have any opacity, even 0

@@ -85,6 +85,9 @@ that are came apart by 0.12 at most (of 387 joints); a chair's seat, which turne
 0.49 and 0.58 away."""
 _IN_TOUCH = 0.1
 """Largest gap of two parts of a group that only a free joint carries, as a share of the object's radius."""
+_AS_SUPPORTED = 1.5
+"""A joint closes a loop if its gap and its cost are at most this many times the largest of the loop's joints in the
+tree."""
 
 
 def object_radius(points: dict[int, Tensor]) -> float:
@@ -419,7 +422,8 @@ def _closes_loop(tree: KinematicTree, joint: Joint, contact: Contact, object_rad
     # With more freedom a fit proves too little.
     if joint.fit.dofs != 1 or joint.fit.ambiguous or joint.fit.undetermined:
         return False
-    if joint.gap > 1.5 * max(j.gap for j in on_cycle) or joint.cost > 1.5 * max(j.cost for j in on_cycle):
+    gap, cost = max(j.gap for j in on_cycle), max(j.cost for j in on_cycle)
+    if joint.gap > _AS_SUPPORTED * gap or joint.cost > _AS_SUPPORTED * cost:
         return False
     if joint.fit.type == "prismatic" and joint.fit.num_shown == 2:
         return False

@@ -119,6 +119,11 @@ def test_what_gsplat_takes_is_taken(backend):
         assert rasterization(**scene(colors=torch.zeros(shape)), sh_degree=2, backend=backend)[0].shape[-1] == 3
     nothing = {k: v[:0] if torch.is_tensor(v) and len(v) == N else v for k, v in s.items()}
     assert not rasterization(**nothing, backend=backend)[0].any()
+    nobody = scene(means=s["means"].clone().requires_grad_(), viewmats=s["viewmats"][:0], Ks=s["Ks"][:0])
+    images = rasterization(**nobody, backend=backend)[0]
+    assert images.shape == (0, s["height"], s["width"], s["colors"].shape[-1])
+    images.sum().backward()
+    assert not nobody["means"].grad.any()
     # The background of depth is 0, whatever is behind the colours.
     assert rasterization(**scene(backgrounds=torch.ones(C, 1)), render_mode="D", backend=backend)[0].shape[-1] == 1
 
