@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture import images
-from splatart_ns.capture.capture import Capture, CaptureError, Frame, Normalization, State
+from splatart_ns.capture.capture import UNLABELLED, Capture, CaptureError, Frame, Normalization, State
 from splatart_ns.capture.images import (
     downscale_labels,
     read_depth_for,
@@ -111,6 +111,11 @@ def load_views(capture: Capture, state: int | State, split: str = "train", downs
         return list(pool.map(lambda frame: load_view(frame, capture.normalization, downscale), frames))
 
 
+def evenly(views: Sequence[View], most: int) -> Sequence[View]:
+    """At most so many of some views, evenly spread over them."""
+    return views if len(views) <= most else [views[len(views) * k // most] for k in range(most)]
+
+
 def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) -> View:
     """One view. Its alpha is the image's where there is one, without what the frame's object mask leaves out; for an
     opaque image, also one whose alpha is 255 everywhere, it is the mask, and None when there is none.
@@ -140,6 +145,8 @@ def load_view(frame: Frame, normalization: Normalization, downscale: int = 1) ->
         labels = torch.from_numpy(downscale_labels(ids, downscale))
     if frame.mask is not None:
         mask = torch.from_numpy(read(frame.mask, read_mask) > 127)
+        if labels is not None:
+            labels = torch.where(mask, labels, UNLABELLED)
     if frame.depth is not None:
         measured = read_depth_for(frame.depth, distorted, normalization.scale * frame.depth_unit)
         depth = torch.from_numpy(downscale_labels(undistort_labels(measured, distorted, unknown=0), downscale))

@@ -226,7 +226,8 @@ class SplatartModel(SplatfactoModel):
             CONSOLE.print(
                 "Images do not tell where the object ends: figures are measured within its rendered silhouette, and "
                 "do not compare with those of other captures.",
-                **{"markup": False, "soft_wrap": True},
+                markup=False,
+                soft_wrap=True,
             )
 
     def _lpips(self) -> nn.Module:

@@ -487,7 +487,7 @@ class PosePipeline(VanillaPipeline):
             chosen = [view for of, view in views[turn % every :: every] if of == s]
             shown = torch.cat([known.new_ones(1), known[s]])[ids]
             moved = splat.select(shown).transformed(torch.cat([torch.eye(4).to(T)[None], T[s]])[ids[shown]])
-            found = found.plus(absences(moved, chosen, self.config.seed + turn), shown)
+            found = found.plus(absences(moved, chosen, self.config.seed + turn * model.num_states + s), shown)
         return found
 
     def _tell_errors(self) -> None:

@@ -105,7 +105,8 @@ def find_semantic_runs(runs_dir: Path, capture: Path, num_states: int) -> tuple[
         CONSOLE.print(
             f"Warning: these runs had different settings ({', '.join(names)}), so that one state is worse known than "
             "another; train them alike, or name others by --pipeline.semantic-runs.",
-            **{"markup": False, "soft_wrap": True},
+            markup=False,
+            soft_wrap=True,
         )
     return runs
 

@@ -20,8 +20,8 @@ from splatart_ns.splats.splat import Splat
 _MAX_HEADER_BYTES = 1 << 16
 _MOST_NORM = 1e12
 """Of quaternions; beyond it, and below one over it, float32 cannot square them."""
-_MOST_LOG_SCALE = 40.0
-"""Larger Gaussians have variances that float32 cannot hold once they are rendered."""
+_MOST_LOG_SCALE = 30.0
+"""Larger Gaussians have variances in pixels that float32 cannot hold once they are rendered."""
 _SH_DEGREE_OF_REST = {0: 0, 9: 1, 24: 2, 45: 3}
 _CENTRE = ["x", "y", "z"]
 _COLOUR = ["f_dc_0", "f_dc_1", "f_dc_2"]

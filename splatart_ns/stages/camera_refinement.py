@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.capture.view import View
-from splatart_ns.geometry.se3 import inverse, se3_exp, se3_log, transform_points, translation
+from splatart_ns.geometry.se3 import inverse, se3_exp, se3_log, so3_log, transform_points, translation
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import PartView, huber_cost, part_view
 from splatart_ns.stages.refinement import STEP, increment, linearized, trial_steps
@@ -137,8 +137,8 @@ def _without_drift(viewmats: Tensor, given: Tensor, centroid: Tensor) -> Tensor:
 def image_shift(viewmats: Tensor, given: Tensor, views: Sequence[View]) -> float:
     """By how many pixels, root mean square, world-to-camera matrices [N, 4, 4] see the world's origin elsewhere than
     the `given` ones [N, 4, 4] do."""
-    focal = torch.stack([view.K[0, 0] for view in views]).to(viewmats)
-    now, before = (V[:, :2, 3] / V[:, 2:3, 3] * focal[:, None] for V in (viewmats, given.to(viewmats)))
+    focal = torch.stack([view.K.diagonal()[:2] for view in views]).to(viewmats)
+    now, before = (V[:, :2, 3] / V[:, 2:3, 3] * focal for V in (viewmats, given.to(viewmats)))
     return float((now - before).square().sum(-1).mean().sqrt())
 
 
@@ -154,7 +154,7 @@ class CameraChange:
 
 def camera_change(viewmats: Tensor, given: Tensor) -> CameraChange:
     """Between world-to-camera matrices [N, 4, 4]."""
-    turned = se3_log(viewmats @ inverse(given.to(viewmats)))[:, 3:].norm(dim=-1)
+    turned = so3_log((viewmats @ inverse(given.to(viewmats)))[:, :3, :3]).norm(dim=-1)
     centres, before = (inverse(V.to(viewmats))[:, :3, 3] for V in (viewmats, given))
     moved = (centres - before).norm(dim=-1) / before.norm(dim=-1)
     rms = [float(x.square().mean().sqrt()) for x in (turned.rad2deg(), 100 * moved)]

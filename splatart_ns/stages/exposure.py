@@ -23,8 +23,8 @@ FRAMES = 16
 def frame_gains(splat: Splat, views: Sequence[View], sh_degree: int | None = None) -> Tensor:
     """How many times brighter than the splat each view's image is, by channel [N, 3].
 
-    Least squares between rendering and image on the object's pixels; 1 where none counts, and the geometric mean of the
-    others is 1.
+    Least squares between rendering and image on the object's pixels, as far as they count; 1 where none does, and the
+    geometric mean of the others is 1.
     """
     gains, tell = [], []
     for view in views:
@@ -33,6 +33,8 @@ def frame_gains(splat: Splat, views: Sequence[View], sh_degree: int | None = Non
         counts = (rendering.accumulation[0] > 0.9) & (view.rgb < CLIPPED).all(-1, keepdim=True).to(splat.means.device)
         if view.alpha is not None:
             counts &= (view.alpha > 250)[..., None].to(counts.device)
+        if view.mask is not None:
+            counts &= view.mask[..., None].to(counts.device)
         shown = rendering.rgb[0] * counts
         image = view.rgb.to(shown) / 255 * counts
         dark = DARK**2 * counts.sum()

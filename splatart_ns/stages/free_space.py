@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from splatart_ns.capture.hull import project
-from splatart_ns.capture.view import View
+from splatart_ns.capture.view import View, evenly
 from splatart_ns.geometry.se3 import inverse
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import PartPair
@@ -39,7 +39,7 @@ class FreeSpace:
     def of(views: Sequence[View]) -> FreeSpace:
         """Of views that tell a background, at most `MAX_VIEWS` of them."""
         chosen, empty = [], []
-        for view in views[:: -(-len(views) // MAX_VIEWS)]:
+        for view in evenly(views, MAX_VIEWS):
             if view.alpha is None and view.labels is None:
                 continue
             background = view.labels == 0 if view.alpha is None else view.alpha < 128

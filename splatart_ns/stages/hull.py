@@ -90,7 +90,8 @@ def inside_silhouettes(views: Sequence[View], grid: Tensor, dilate: int, erring:
     """Which points [N, 3] lie inside every silhouette but `erring` ones, and are seen at all: [N] bool.
 
     Beyond an image's border see `admitted`. A view with an empty silhouette, which would leave no point at all, says
-    nothing. `dilate` widens the silhouettes by so many pixels. If views may err, what is `FAINT` counts.
+    nothing, nor do pixels that its mask leaves out. `dilate` widens the silhouettes by so many pixels. If views may
+    err, what is `FAINT` counts.
     """
     left = torch.arange(len(grid))
     seen, missed = torch.zeros(len(grid), dtype=torch.bool), torch.zeros(len(grid), dtype=torch.int32)
@@ -98,6 +99,8 @@ def inside_silhouettes(views: Sequence[View], grid: Tensor, dilate: int, erring:
         silhouette = view.alpha > (FAINT if erring else 127)
         if not silhouette.any():
             continue
+        if view.mask is not None:
+            silhouette = silhouette | ~view.mask
         lets, inside = admitted(view, silhouette, grid[left], dilate)
         missed += ~lets
         # Most points fall to the first few views; the others need not look at them.
@@ -124,6 +127,8 @@ def _uncovered(views: Sequence[View], voxels: Tensor, size: float) -> float:
     missed, total = 0.0, 0.0
     for view in views:
         silhouette = view.alpha > 127
+        if view.mask is not None:
+            silhouette = silhouette & view.mask
         missed += float(missing(view, silhouette, voxels, max(1, footprint(view, size))).sum())
         total += float(silhouette.sum())
     return missed / max(total, 1.0)

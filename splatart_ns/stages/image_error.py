@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splatart_ns.capture.view import View
+from splatart_ns.capture.view import View, evenly
 from splatart_ns.errors import InputError
 from splatart_ns.rasterize.render import Rendering, render
 from splatart_ns.splats.splat import Splat
@@ -40,7 +40,7 @@ def image_error(splat: Splat, views: Sequence[View]) -> ImageError:
     views = [view for view in views if view.mask is None or view.mask.any()]
     if not views:
         raise InputError("the masks leave no pixel of any training image of a state: larger images or other masks do")
-    chosen = [views[len(views) * k // MAX_VIEWS] for k in range(MAX_VIEWS)] if len(views) > MAX_VIEWS else views
+    chosen = evenly(views, MAX_VIEWS)
     psnr, by_part = (torch.stack(of) for of in zip(*side_by_side(lambda v: _error(splat, v), chosen), strict=True))
     by_part = by_part.sum(0) / max(sum(float(view.alpha.float().sum()) / 255 for view in chosen), 1.0)
     return ImageError(float(psnr.mean()), float(by_part.sum()), by_part)

@@ -209,7 +209,11 @@ def _undetermined(fit: JointFit, object_radius: float, rotation_sigma: float) ->
         notes.append("The parts did not move relative to each other, so axis, origin and type are undetermined.")
     if fit.type in ("fixed", "prismatic") and rotation_sigma > UNSEEN_ROTATION:
         notes.append("The part looks alike from some sides, so that it may have turned unseen.")
-    sigma = {k: math.sqrt(torch.linalg.eigvalsh(C)[-1].clamp_min(0)) for k, C in fit.covariance.items()}
+    sigma = {
+        name: math.sqrt(torch.linalg.eigvalsh(C)[-1].clamp_min(0))
+        for name, C in fit.covariance.items()
+        if name in ("axis", "origin")
+    }
     if sigma.get("axis", 0.0) > _UNDETERMINED_AXIS:
         degrees = math.degrees(min(sigma["axis"], math.pi))
         notes.append(f"The axis is undetermined: its standard deviation is {degrees:.0f} degrees.")
@@ -218,7 +222,9 @@ def _undetermined(fit: JointFit, object_radius: float, rotation_sigma: float) ->
         notes.append(f"The origin is undetermined: its standard deviation is {share:.2g} of the object's radius.")
     if not fit.converged:
         notes.append("The fit did not converge, so its figures and their uncertainty are rough.")
-    if fit.type in ("revolute", "screw") and sigma["values"] > UNSEEN_ROTATION:
-        degrees = math.degrees(min(sigma["values"], math.pi))
-        notes.append(f"The values are undetermined: their standard deviation is up to {degrees:.0f} degrees.")
+    if fit.type in ("revolute", "screw"):
+        most = math.sqrt(fit.covariance["values"].diagonal().max().clamp_min(0))
+        if most > UNSEEN_ROTATION:
+            degrees = math.degrees(min(most, math.pi))
+            notes.append(f"The values are undetermined: their standard deviation is up to {degrees:.0f} degrees.")
     return notes

@@ -90,7 +90,8 @@ class JointFit:
         """
         points = points.to(self.origin)
         if self.type in ("fixed", "spherical", "free"):
-            flipped = replace(self, values=-self.values)
+            origin = self.origin if self.type == "spherical" else points.mean(0)
+            flipped = replace(self, values=self.values if self.type == "fixed" else -self.values, origin=origin)
             return replace(flipped, residual=mean_distance(points, T_rel[1:], flipped.motion(flipped.values[1:])))
         centroid = points.mean(0)
         along = float(self.axis @ (centroid - self.origin))

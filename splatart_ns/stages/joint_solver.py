@@ -78,6 +78,16 @@ def _closed_form(kind: str, T: Tensor) -> Joints:
     return axis, point, pitch, torch.cat([slides, values], -1) if kind == "cylindrical" else values
 
 
+def _narrowest(turns: Tensor) -> Tensor:
+    """Turns [B, n, 1] about one axis, each told but for whole ones, so that with the 0 of state 0 they span least: none
+    lies in the widest gap that they leave of the circle."""
+    ring = pad(turns[..., 0], (1, 0)).remainder(2 * math.pi)
+    around = ring.sort(1).values
+    gaps = torch.cat([around[:, 1:], around[:, :1] + 2 * math.pi], 1) - around
+    last = around.gather(1, gaps.argmax(1, keepdim=True))
+    return torch.where(ring > last, ring - 2 * math.pi, ring)[:, 1:, None]
+
+
 def _fixed_point(R: Tensor, t: Tensor, span: Tensor) -> Tensor:
     """The points [B, 3] in the span of columns [B, 3, K] that the motions (R, t) [B, n] move least."""
     A = ((torch.eye(3).to(R) - R) @ span[:, None]).flatten(1, 2)
@@ -175,8 +185,7 @@ def _results(
     axis, point, pitch, values = joints
     model = model_motions(kind, joints)
     if kind in ("revolute", "cylindrical"):
-        turns = torch.remainder(values[..., -1:] + math.pi, 2 * math.pi) - math.pi
-        values = torch.cat([values[..., :-1], turns], -1)
+        values = torch.cat([values[..., :-1], _narrowest(values[..., -1:])], -1)
     sign = torch.ones_like(cost)[:, None]
     if kind not in ("fixed", "spherical"):
         last = values[..., -1]

@@ -40,7 +40,7 @@ def merge_parts(
         One splat per part; empty for a part without Gaussians. Background and unseen Gaussians are gone.
     """
     seen = seen or [visibility(s, v) for s, v in zip(splats, views, strict=True)]
-    footprint = _pixel_footprint(views[0])
+    footprint = _pixel_footprint([view for of_state in views for view in of_state])
     known = torch.ones(T.shape[:2], dtype=torch.bool) if known is None else known
     return [_merge_part(splats, seen, T[:, p], known[:, p], p + 1, footprint) for p in range(T.shape[1])]
 

@@ -149,7 +149,8 @@ def _slid_a_little(pair: PartPair, stays: Refinement) -> Refinement | None:
     """
     T, equations = stays.T, stays.equations
     shift = NormalEquations(equations.H[:, :3, :3], equations.g[:, :3], equations.cost)
-    step = -torch.linalg.solve(shift.H.sum(0), shift.g.sum(0)) * pair.radius
+    H = shift.H.sum(0)
+    step = -torch.linalg.solve(H + 1e-12 * torch.eye(3).to(H), shift.g.sum(0)) * pair.radius
     if _deviations(step, motion_covariance(pair, T, shift)) < SLID:
         return None
     slide = shifted(pair, T, T[:3, :3])

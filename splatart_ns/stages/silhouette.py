@@ -27,10 +27,19 @@ def with_silhouette(view: View) -> View | None:
     return replace(view, alpha=alpha, mask=counts if view.mask is None else view.mask & counts)
 
 
+STEEPER = 4.0
+"""A rendered silhouette is none of the object where its Gaussians' share is three eighths, and all where it is five."""
+
+
 def rendered_silhouette(view: View, splat: Splat) -> View:
-    """The view with the alpha that a labelled splat of object and surroundings shows: its share of parts' Gaussians."""
+    """The view with the alpha that a labelled splat of object and surroundings shows: its share of parts' Gaussians.
+
+    Steeper than that share is: things are opaque, but for pixels at their edges, while Gaussians of the object let what
+    is behind them through, of which training does not ask that it be the object's.
+    """
     share = 1 - _shares(view, splat)[..., 0]
-    return replace(view, alpha=(255 * share.clamp(0, 1)).round().to(torch.uint8))
+    alpha = (0.5 + STEEPER * (share - 0.5)).clamp(0, 1)
+    return replace(view, alpha=(255 * alpha).round().to(torch.uint8))
 
 
 SHOWN = 0.1

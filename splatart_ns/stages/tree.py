@@ -120,7 +120,8 @@ def infer_tree(
     where they name a type, the first method fits it. `names`: what reasons and errors call the parts.
 
     Raises:
-        InputError: the constraints contradict each other or the root, or name a part without points.
+        InputError: the constraints contradict each other or the root, or name a part without points, or a parent that
+            is not known at state 0.
     """
     names = names or _numbered({*points, *(p for c in constraints for p in (c.parent, c.child))})
     if missing := {p for c in constraints for p in (c.parent, c.child)} - set(points):
@@ -129,6 +130,8 @@ def infer_tree(
     radius = object_radius(points)
     known = known_states(motions, covariances)
     lost = {p for p in points if not known[p][0]}
+    if blind := set(required.values()) & lost:
+        raise InputError(f"--joint: nothing can hang on {names[min(blind)]}, which state 0 does not show; leave it out")
     if root is None:
         free = _possible_roots(set(points) - set(required), motions, covariances, known)
         root = choose_root({p: points[p] for p in free}, motions, radius, noise)
@@ -146,8 +149,8 @@ def infer_tree(
     joints, contradicted = _as_told(constraints, joints, points, motions, radius, names, **certainty)
     # A part of which nothing tells where it is at state 0 hangs on others, and nothing hangs on it.
     joints = {(a, b): fit for (a, b), fit in joints.items() if a not in lost}
-    blind = {(a, b) for a, b in joints if leads_blindly(known[a], known[b]) and required.get(b) != a}
-    joints = {edge: fit for edge, fit in joints.items() if edge not in blind}
+    blindly = {(a, b) for a, b in joints if leads_blindly(known[a], known[b]) and required.get(b) != a}
+    joints = {edge: fit for edge, fit in joints.items() if edge not in blindly}
     contacts = find_contacts(points, motions, {_pair(*edge) for edge, fit in joints.items() if fit.accepted}, known)
     far = {pair for pair, contact in contacts.items() if contact.gap > _APART * radius}
     far -= {_pair(c.parent, c.child) for c in constraints if not c.forbidden}

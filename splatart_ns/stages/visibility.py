@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from splatart_ns.capture.view import View
+from splatart_ns.capture.view import View, evenly
 from splatart_ns.rasterize.render import Rendering, render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.threads import side_by_side
@@ -37,7 +37,7 @@ def clearest(splat: Splat, views: Sequence[View]) -> Tensor:
 
 def looked_at(splat: Splat, views: Sequence[View]) -> tuple[Tensor, Tensor]:
     """`visibility` and `clearest` at the price of one."""
-    views = views[:: -(-len(views) // MAX_VIEWS)]
+    views = evenly(views, MAX_VIEWS)
     contributions, alone = map(torch.stack, zip(*side_by_side(partial(_contribution, splat), views), strict=True))
     share = torch.where(alone > 0, contributions / alone.clamp_min(1e-6), 0.0)
     return contributions.mean(0), share.amax(0)

@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 
-from splatart_ns.capture.capture import Normalization
+from splatart_ns.capture.capture import UNLABELLED, Normalization
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.capture.view import load_points, load_views
 from splatart_ns.errors import InputError
@@ -84,6 +84,7 @@ def test_the_loss_mask_is_every_pixel_that_is_not_black(capture_folder, edit):
     view = load_views(load_capture(capture_folder), 0)[0]
     assert view.mask.dtype == torch.bool
     assert view.mask.nonzero().tolist() == [[0, 0], [0, 1]]
+    assert (view.labels == UNLABELLED).nonzero().tolist() == (~view.mask).nonzero().tolist()
 
 
 def test_frames_without_labels_or_alpha_have_none(capture_folder, edit):

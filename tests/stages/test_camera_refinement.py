@@ -67,6 +67,8 @@ def test_a_shift_is_told_in_pixels_of_the_image(scene):
     given, aside = viewmats(views), viewmats(views)
     aside[:, 1, 3] += 3 * aside[:, 2, 3] / torch.stack([view.K[1, 1] for view in views])
     assert image_shift(aside, given, views) == pytest.approx(3)
+    tall = [replace(view, K=view.K * torch.tensor([[1.0], [2.0], [1.0]])) for view in views]
+    assert image_shift(aside, given, tall) == pytest.approx(6)
 
 
 def test_what_all_cameras_have_in_common_stays(scene):

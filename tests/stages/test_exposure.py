@@ -96,3 +96,13 @@ def test_an_image_keeps_its_type():
     gain = torch.tensor([0.5, 0.5, 2.0])
     assert at_gain(image, gain).tolist() == [[[200, 255, 25]]]
     assert torch.allclose(at_gain(image / 255, gain), torch.tensor([[[200 / 255, 1.0, 25 / 255]]]))
+
+
+def test_what_a_mask_leaves_out_tells_no_gain(scene):
+    """A dark hand before a half of every other frame."""
+    splat, views = scene
+    masks = [torch.arange(v.width).expand(v.height, -1) >= (v.width // 2 if k % 2 else 0) for k, v in enumerate(views)]
+    before = [replace(v, rgb=torch.where(m[..., None], v.rgb, 9), mask=m) for v, m in zip(views, masks, strict=True)]
+    assert float(frame_gains(splat, before).log().abs().max()) < 0.05
+    unmasked = [replace(v, mask=None) for v in before]
+    assert float(frame_gains(splat, unmasked).log().abs().max()) > 0.2

@@ -188,3 +188,20 @@ def test_views_that_may_err_do_not_hide_that_cameras_are_a_little_off():
     views = photograph(box(1, (0.8, 0.12, 0.12), (0.0, 0.0, 0.0)), 30)
     wrong = [replace(v, viewmat=se3_exp(0.006 * torch.randn(6, generator=g)) @ v.viewmat) for v in views]
     assert slack(wrong)[0].pixels > 0
+
+
+def test_what_a_mask_leaves_out_carves_nothing_and_need_not_be_filled():
+    masked = list(VIEWS)
+    left = torch.arange(VIEWS[0].width).expand(VIEWS[0].height, -1) < VIEWS[0].width // 2
+    masked[3] = replace(VIEWS[3], alpha=VIEWS[3].alpha.where(left, 0), mask=left)
+    found, _ = slack(masked)
+    assert found == EXACT
+    whole, carved, left_out = (
+        len(voxels) * size**3
+        for voxels, size in map(visual_hull, (VIEWS, [replace(view, mask=None) for view in masked], masked))
+    )
+    assert carved < 0.8 * whole < 0.98 * whole < left_out < 1.1 * whole
+    # Nor is a hand looked for that the silhouette has for the object.
+    hand = list(VIEWS)
+    hand[3] = replace(VIEWS[3], alpha=VIEWS[3].alpha.where(left, 255), mask=left)
+    assert slack(hand)[0] == EXACT

@@ -262,6 +262,34 @@ def test_reversing_a_joint_of_more_freedom(kind):
         assert back.residual < 0.02
 
 
+def test_a_fixed_joint_reversed_is_at_the_other_part():
+    scene, other, eye = Scene(18), Scene(19), torch.eye(4).double().expand(3, 4, 4)
+    back = fit_joint(eye, scene.points, object_radius=1.0).reversed(other.points, eye)
+    assert torch.equal(back.origin, other.points.mean(0)) and not torch.signbit(back.values).any()
+
+
+@pytest.mark.parametrize(
+    "degrees, span",
+    [
+        ((60, 120, 179), 179),
+        ((60, 120, 181), 181),
+        ((100, 170, 200), 200),
+        ((-100, -250), 210),
+        ((150, 210), 210),
+        ((-170,), 170),
+        ((190,), 170),
+    ],
+)
+def test_turns_past_half_a_turn_stay_together(degrees, span):
+    scene = Scene(3)
+    values = [0.0, *map(math.radians, degrees)]
+    fit = fit_joint(scene.motions("revolute", values), scene.points, object_radius=1.0)
+    assert fit.type == "revolute" and fit.values[0] == 0
+    low, high = fit.limits
+    assert math.degrees(high - low) == pytest.approx(span)
+    assert torch.allclose(fit.motion(fit.values), scene.motions("revolute", values), atol=1e-6)
+
+
 def test_noise_that_was_underestimated_does_not_buy_freedom():
     scenes = [Scene(seed) for seed in range(40)]
     T = torch.stack([scene.motions("revolute", [0.0, 0.7, -0.5, 1.2], noise=0.003) for scene in scenes])

@@ -1,11 +1,12 @@
 from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
 from part_scene import box, photograph
 
 from splatart_ns.capture.capture import UNLABELLED
 from splatart_ns.splats.splat import Splat
-from splatart_ns.stages.silhouette import rendered_silhouette, with_rendered_labels, with_silhouette
+from splatart_ns.stages.silhouette import _shares, rendered_silhouette, with_rendered_labels, with_silhouette
 
 OBJECT = box(1, (0.5, 0.4, 0.3), (0.0, 0.0, 0.0))
 FLOOR = box(0, (2.0, 2.0, 0.1), (0.0, 0.0, -0.5))
@@ -46,3 +47,15 @@ def test_what_the_splat_misses_stays_unlabelled():
     missed = (made.labels == UNLABELLED) & (VIEW.alpha > 0)
     assert 0.1 < missed.sum() / (VIEW.alpha > 0).sum() < 0.9
     assert not (made.labels == UNLABELLED)[VIEW.alpha == 0].any()
+
+
+def test_a_silhouette_is_whole_where_the_object_lets_a_little_of_what_is_behind_it_through():
+    opaque = replace(VIEW, alpha=None, labels=None)
+    thin = replace(OBJECT, opacity_logits=torch.full_like(OBJECT.opacity_logits, -1.6))
+    splat = Splat.cat([thin, FLOOR, box(0, (3.0, 3.0, 0.1), (0.0, 0.0, -1.2))])
+    inner = F.max_pool2d((VIEW.labels == 0).float()[None], 5, 1, 2)[0] == 0
+    share = 1 - _shares(opaque, splat)[..., 0][inner]
+    assert 0.7 < share.median() < 0.95
+    silhouette = rendered_silhouette(opaque, splat).alpha
+    assert (silhouette[inner] == 255).float().mean() > 0.95
+    assert silhouette[VIEW.labels == 0].float().mean() < 10

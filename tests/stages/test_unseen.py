@@ -4,6 +4,7 @@ import pytest
 import torch
 from part_scene import box, motion
 
+from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import inverse, transform_points
 from splatart_ns.stages.joint_constraint import JointConstraint
 from splatart_ns.stages.joint_pairs import fit_pairs
@@ -158,3 +159,11 @@ def test_motions_that_are_all_known_are_only_compared():
     R, place, said = relative_motion(a, a @ motion((5, 0, 0), (0, 1, 0)), YES, YES)
     assert torch.equal(place, EYE) and said.all()
     assert torch.allclose(R, motion((5, 0, 0), (0, 1, 0)).expand(3, 4, 4))
+
+
+def test_the_user_hangs_nothing_on_a_part_that_state_0_does_not_show():
+    points, motions, covariances = scene(turntable=False)
+    with pytest.raises(InputError, match="nothing can hang on tray, which state 0 does not show"):
+        names = {1: "foot", 2: "body", 3: "door", 4: "tray"}
+        told = [JointConstraint(4, 3)]
+        infer_tree(points, motions, covariances=covariances, root=1, constraints=told, names=names)
