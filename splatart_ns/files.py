@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
 import tempfile
 import uuid
 from collections.abc import Iterator, Sequence
@@ -52,24 +51,38 @@ def new_folder(path: Path) -> Iterator[Path]:
 
     Raises `InputError` if `path` is in use or cannot be written.
     """
+    path, given = path.resolve(), path
     if path.exists() and path.samefile(Path.cwd()):
-        raise InputError(f"{path}: is the folder that you are in; give another output folder.")
+        raise InputError(f"{given}: is the folder that you are in; give another output folder.")
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise InputError(f"{path}: is there already and not empty; give another output folder, or remove it.")
+        raise InputError(f"{given}: is there already and not empty; give another output folder, or remove it.")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
+        scratch = scratch_folder(path)
+        fresh = Path(scratch.name) / "new"
+        fresh.mkdir()
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); give another output folder.") from error
-    with errors_about(path, temporary):
-        try:
-            temporary.chmod(0o755)
-            yield temporary
-            if path.exists():
-                path.rmdir()
-            os.replace(temporary, path)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+        raise InputError(f"{given}: cannot be written ({error.strerror}); give another output folder.") from error
+    with scratch, errors_about(given, fresh):
+        yield fresh
+        put_in_place(fresh, path)
+
+
+def scratch_folder(path: Path) -> tempfile.TemporaryDirectory:
+    """A folder on the file system of a folder `path`, which need not be there: beside it, or in it if it is a mount."""
+    parent = path if path.is_mount() else path.parent
+    parent.mkdir(parents=True, exist_ok=True)
+    return tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=".tmp", dir=parent)
+
+
+def put_in_place(folder: Path, path: Path) -> None:
+    """Make a folder `path`, which is empty or not there. A mount, which none can replace, gets what is in it."""
+    if path.is_mount():
+        for inner in folder.iterdir():
+            os.replace(inner, path / inner.name)
+        return
+    if path.exists():
+        path.rmdir()
+    os.replace(folder, path)
 
 
 @contextmanager

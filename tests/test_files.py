@@ -1,6 +1,7 @@
 import errno
 import json
 import math
+import os
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,41 @@ def test_the_folder_that_one_is_in_is_refused_before_the_work(tmp_path, monkeypa
     monkeypatch.chdir(tmp_path / "here")
     with pytest.raises(InputError, match="is the folder that you are in"), new_folder(Path(name)):
         raise AssertionError
+
+
+def test_a_link_to_an_empty_folder_and_one_to_none_lead_to_the_new_folder(tmp_path):
+    (tmp_path / "empty").mkdir()
+    for name in ("empty", "none"):
+        (tmp_path / f"to_{name}").symlink_to(tmp_path / name)
+        with new_folder(tmp_path / f"to_{name}") as folder:
+            (folder / "a").touch()
+        assert (tmp_path / name / "a").is_file() and (tmp_path / f"to_{name}").is_symlink()
+    assert {path.name for path in tmp_path.iterdir()} == {"empty", "none", "to_empty", "to_none"}
+
+
+def test_a_mount_gets_what_the_new_folder_holds(tmp_path, monkeypatch):
+    monkeypatch.setattr(Path, "is_mount", lambda path: path.name == "out")
+    (tmp_path / "out").mkdir()
+    before = (tmp_path / "out").stat().st_ino
+    with new_folder(tmp_path / "out") as folder:
+        assert folder.is_relative_to(tmp_path / "out")
+        (folder / "inner").mkdir()
+        (folder / "inner/a").touch()
+    assert [path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*")] == [
+        "inner",
+        "inner/a",
+    ]
+    assert (tmp_path / "out").stat().st_ino == before
+
+
+def test_a_new_folder_lets_in_whom_the_mask_lets_in(tmp_path):
+    before = os.umask(0o027)
+    try:
+        with new_folder(tmp_path / "out"):
+            pass
+    finally:
+        os.umask(before)
+    assert (tmp_path / "out").stat().st_mode & 0o777 == 0o750
 
 
 def test_a_folder_in_which_nothing_can_be_written_is_told(tmp_path):

@@ -15,6 +15,7 @@ from typing import Any, get_args
 from splatart_ns.batch.storage import Folder, Storage, join, open_storage, require_folder
 from splatart_ns.choices import Quality, require_downscale, require_seed
 from splatart_ns.errors import InputError
+from splatart_ns.shape import repeated_key
 
 _TRANSFORMS = "transforms.json"
 _MARKS = (
@@ -147,11 +148,16 @@ def _csv_rows(source: str, text: str) -> Iterable[tuple[int, dict[str, Any]]]:
 
 
 def _json_rows(source: str, text: str) -> Iterable[tuple[int, dict[str, Any]]]:
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if (key := repeated_key(pairs)) is not None:
+            raise ValueError(f"an object has the key {key!r} twice")
+        return dict(pairs)
+
     for number, line in enumerate(text.split("\n"), 1):  # texts of JSON may hold other ends of lines
         if not line.strip():
             continue
         try:
-            row = json.loads(line)
+            row = json.loads(line, object_pairs_hook=unique)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{source}, line {number}: is not JSON ({error}); mend it.") from None
         if not isinstance(row, dict):

@@ -7,6 +7,7 @@ import io
 import json
 import math
 import re
+import shutil
 import tarfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from splatart_ns.batch.entry import Entry
 from splatart_ns.batch.stage import Needs, Stage, Work, stage_key
 from splatart_ns.batch.storage import Storage, join, open_storage, require_folder
-from splatart_ns.capture.synthesis_options import MOST_PIXELS
+from splatart_ns.capture.synthesis_options import MOST_PIXELS, MOST_STATES
 from splatart_ns.errors import InputError
 
 if TYPE_CHECKING:
@@ -79,6 +80,8 @@ class Shards(Sequence[Entry]):
         for name in ("images", "shard_size", "states"):
             if (value := getattr(options, name)) < 1:
                 raise InputError(f"--{name.replace('_', '-')} is {value}; give 1 or more.")
+        if options.states > MOST_STATES:
+            raise InputError(f"--states is {options.states}; give {MOST_STATES} or less.")
         if not 8 <= options.resolution <= MOST_PIXELS:
             raise InputError(f"--resolution is {options.resolution}; give 8 to {MOST_PIXELS}.")
         self._url, self._bundles, self._options = open_storage(source).url, bundles, options
@@ -173,7 +176,8 @@ class Sharding:
         from splatart_ns.bundle.dataset import Dataset, DatasetOptions
 
         source, folder = open_storage(work.entry.capture), work.folder.parent / "bundle-read"
-        (folder / "parts").mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)  # of the bundle before
+        (folder / "parts").mkdir(parents=True)
         source.get(join(name, "parts"), folder / "parts")
         (folder / _ARTICULATION).write_bytes(source.read(join(name, _ARTICULATION)) or b"")
         # Bundles of one seed would be seen from the same places.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from typing import Any
 
 import torch
@@ -33,15 +33,20 @@ def assemble_bundle(
     parts = [
         Part(p, part_names[p], splats[p], motions[p].double(), covariances[p].double()) for p in sorted(part_names)
     ]
-    joints = [_joint(j, part_names, in_tree=True) for j in tree.joints]
-    joints += [_joint(j, part_names, in_tree=False) for j in tree.loops]
+    joints: list[Joint] = []
+    for in_tree, of_tree in ((True, tree.joints), (False, tree.loops)):
+        for joint in of_tree:
+            joints.append(_joint(joint, part_names, {j.name for j in joints}, in_tree))
     bundle = Bundle(
         parts,
         joints,
         part_names[tree.root],
         list(states),
         length_unit,
-        [_loop(tree, j, part_names) for j in tree.loops],
+        [
+            _loop(tree, loop, joint.name, part_names)
+            for loop, joint in zip(tree.loops, joints[len(tree.joints) :], strict=True)
+        ],
         provenance,
     )
     hung = {part_names[tree.root], *(j.child for j in bundle.tree_joints)}
@@ -57,9 +62,9 @@ def _observed(bundle: Bundle, root_motion: Tensor, state: int) -> dict[str, Tens
     return {name: root_motion[state] @ T for name, T in configured_motions(bundle, q).items()}
 
 
-def _joint(joint: articulate.Joint, names: Mapping[int, str], in_tree: bool) -> Joint:
+def _joint(joint: articulate.Joint, names: Mapping[int, str], taken: Set[str], in_tree: bool) -> Joint:
     fit, name = joint.fit, f"{names[joint.parent]}_to_{names[joint.child]}"
-    while name in names.values():  # a joint also goes by the part that it moves
+    while name in taken or name in names.values():  # a joint also goes by the part that it moves
         name += "_joint"
     return Joint(
         name=name,
@@ -84,8 +89,8 @@ def _other_parent(joint: articulate.Joint, names: Mapping[int, str]) -> dict[str
     return {"type": fit.type, "residual": fit.residual, "score": fit.score, "parent": names[joint.parent]}
 
 
-def _loop(tree: KinematicTree, joint: articulate.Joint, names: Mapping[int, str]) -> dict[str, Any]:
-    """The parts around the loop that a joint closes, from its child up and down to its parent."""
+def _loop(tree: KinematicTree, joint: articulate.Joint, name: str, names: Mapping[int, str]) -> dict[str, Any]:
+    """The parts around the loop that a joint of that name closes, from its child up and down to its parent."""
     parents = {j.child: j.parent for j in tree.joints}
 
     def to_root(part: int) -> list[int]:
@@ -97,4 +102,4 @@ def _loop(tree: KinematicTree, joint: articulate.Joint, names: Mapping[int, str]
     up, down = to_root(joint.child), to_root(joint.parent)
     meeting = next(p for p in up if p in down)
     around = up[: up.index(meeting) + 1] + down[: down.index(meeting)][::-1]
-    return {"joint": _joint(joint, names, in_tree=False).name, "parts": [names[p] for p in around]}
+    return {"joint": name, "parts": [names[p] for p in around]}

@@ -13,7 +13,7 @@ import torch
 from splatart_ns.bundle.articulated_splat import ArticulatedSplat, Picture
 from splatart_ns.bundle.camera import SIZED_BY, Camera, bounding_sphere, orbit_camera
 from splatart_ns.bundle.configurations import Configuration
-from splatart_ns.capture.synthesis_options import MOST_PIXELS
+from splatart_ns.capture.synthesis_options import MOST_PIXELS, MOST_STATES
 from splatart_ns.choices import Views
 from splatart_ns.errors import InputError
 
@@ -23,7 +23,6 @@ Unreasonable Effectiveness of Quasirandom Sequences, 2018)."""
 _FREE = 0.25
 """How far the values of all states may be shifted, in distances between them: the less, the further two states are
 apart."""
-_MOST_STATES = 100_000
 """Configurations that there may be."""
 
 
@@ -67,7 +66,7 @@ class Dataset:
     def __init__(self, splat: ArticulatedSplat, options: DatasetOptions | None = None):
         """Raises InputError for options that make no sense."""
         self.splat, self.options = splat, options or DatasetOptions()
-        for name, least, most in (("states", 1, _MOST_STATES), ("resolution", 8, MOST_PIXELS), ("seed", 0, 2**128)):
+        for name, least, most in (("states", 1, MOST_STATES), ("resolution", 8, MOST_PIXELS), ("seed", 0, 2**128)):
             value = getattr(self.options, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer):
                 raise InputError(f"--{name} is {value!r}; give a whole number")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,15 @@ def read_coco(root: Path, file: Path, content: dict[str, Any]) -> Split:
             raise CaptureError(file, f"{key} of {of} is {show(found)}", "export the labels again")
         return found
 
-    categories = sorted(objects("categories"), key=lambda c: field(c, "id", int, "a category"))
+    def once(values: Iterable[dict[str, Any]], of: str) -> Iterator[dict[str, Any]]:
+        seen = set()
+        for value in values:
+            if (number := field(value, "id", int, of)) in seen:
+                raise CaptureError(file, f"the id {number} of {of} is there twice", "export the labels in one piece")
+            seen.add(number)
+            yield value
+
+    categories = sorted(once(objects("categories"), "a category"), key=lambda c: c["id"])
     drawn: dict[int, list[tuple[int, Any]]] = {}
     used = set()
     for annotation in objects("annotations"):
@@ -51,8 +59,8 @@ def read_coco(root: Path, file: Path, content: dict[str, Any]) -> Split:
         check_classes(file, [name for i, name in named.items() if i in used])
 
     images = []
-    for image in objects("images"):
-        number = field(image, "id", int, "an image")
+    for image in once(objects("images"), "an image"):
+        number = image["id"]
         name = field(image, "file_name", str, f"image {number}")
         width, height = (field(image, key, int, f"image {name!r}") for key in ("width", "height"))
         shapes = [(place[category], shape) for category, shape in drawn.pop(number, [])]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -16,7 +17,7 @@ def capture_digest(capture: Capture, states: Sequence[State] | None = None) -> s
     """SHA-256 of all that a fit reads of a capture, or of some of its states alone; not of where the files lie."""
     digest = hashlib.sha256(repr((capture.parts, capture.length_unit, capture.worlds)).encode())
     for state in capture.states if states is None else states:
-        digest.update(state.name.encode() + (state.points.read_bytes() if state.points else b""))
+        digest.update(os.fsencode(state.name) + (state.points.read_bytes() if state.points else b""))
         for frame in state.frames:
             digest.update(repr((frame.name, frame.camera, frame.T_world_camera.tolist(), frame.split)).encode())
             digest.update(repr(frame.depth_unit).encode() if frame.depth else b"")

@@ -30,7 +30,7 @@ from splatart_ns.capture.part_votes import Ballot, PartVotes, read_ballots, vote
 from splatart_ns.capture.seen_surface import LEAST_CONFIRMED, measured_surface, object_pixels
 from splatart_ns.capture.view import View, load_view
 from splatart_ns.capture.worlds import OTHER_WORLDS_MEND
-from splatart_ns.errors import InputError
+from splatart_ns.errors import InputError, printable
 from splatart_ns.machine import num_cores
 
 _PIXELS = 256
@@ -103,7 +103,7 @@ def as_text(examination: Examination) -> str:
     rows: dict[str, list[str]] = {}
     for item in examination.coverage:
         rows.setdefault(item.part, []).append(f"{item.frames} of {item.labelled}")
-    states = [] if examination.capture is None else [state.name for state in examination.capture.states]
+    states = [] if examination.capture is None else [printable(state.name) for state in examination.capture.states]
     if min(examination.shown, default=1) < 1:
         rows["of what all frames show"] = [f"{share:.0%}" for share in examination.shown]
     if rows:
@@ -112,7 +112,7 @@ def as_text(examination: Examination) -> str:
         for part, cells in rows.items():
             aligned = (c.rjust(max(10, len(state))) for c, state in zip(cells, states, strict=True))
             lines.append("  ".join([part.ljust(width), *aligned]))
-    lines += [f"label next: {frame.image}" for frame in examination.suggested]
+    lines += [f"label next: {printable(str(frame.image))}" for frame in examination.suggested]
     counts = {"error": examination.errors, "warning": len(examination.problems) - examination.errors}
     lines.append(", ".join(f"{count} {kind}{'s' * (count != 1)}" for kind, count in counts.items()))
     return "\n".join(lines)

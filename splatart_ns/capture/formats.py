@@ -132,27 +132,42 @@ def read_capture(path: Path | str, report: Report) -> Capture:
         states=tuple(states),
         parts=read_part_names(metas, frames, report),
         worlds=_worlds(metas, report),
-        length_unit=_length_unit(metas),
+        length_unit=_length_unit(metas, report),
         normalization=Normalization.from_frames(frames),
     )
 
 
-def _length_unit(metas: Sequence[_Meta]) -> str:
-    """What the first transforms.json that names one gives as "length_unit"."""
-    units = (meta.get("length_unit") for _, meta in metas)
-    return next((unit for unit in units if isinstance(unit, str) and unit.strip()), "unknown")
+def _length_unit(metas: Sequence[_Meta], report: Report) -> str:
+    """What the states' transforms.json give as "length_unit"."""
+    given = [(file, meta["length_unit"]) for file, meta in metas if meta.get("length_unit") is not None]
+    for file, unit in given:
+        if not isinstance(unit, str):
+            report(Problem("error", file, f'"length_unit" is {show(unit)}', 'write a name, as "metre"'))
+    return _of_all(
+        "length_unit", [(file, u) for file, u in given if isinstance(u, str) and u.strip()], report, "unknown"
+    )
 
 
 def _worlds(metas: Sequence[_Meta], report: Report) -> Worlds:
-    """What the first transforms.json that has one gives as "worlds"."""
-    for file, meta in metas:
-        if "worlds" not in meta:
-            continue
-        if meta["worlds"] in get_args(Worlds):
-            return meta["worlds"]
-        found, mend = f'"worlds" is {show(meta["worlds"])}', f"write one of {', '.join(get_args(Worlds))}"
-        report(Problem("error", file, found, mend))
-    return "shared"
+    """What the states' transforms.json give as "worlds"."""
+    given = [(file, meta["worlds"]) for file, meta in metas if "worlds" in meta]
+    for file, worlds in given:
+        if worlds not in get_args(Worlds):
+            mend = f"write one of {', '.join(get_args(Worlds))}"
+            report(Problem("error", file, f'"worlds" is {show(worlds)}', mend))
+    return _of_all("worlds", [(file, w) for file, w in given if w in get_args(Worlds)], report, "shared")
+
+
+def _of_all(key: str, given: Sequence[tuple[Path, str]], report: Report, otherwise: str) -> str:
+    """The value that files give for all states; the first one's, where another has another, which is an error."""
+    if not given:
+        return otherwise
+    first, value = given[0]
+    for file, other in given[1:]:
+        if other != value:
+            found = f'"{key}" is {show(other)}, but {show(value)} in {first}'
+            report(Problem("error", file, found, "write the same in all states"))
+    return value
 
 
 # ---------------------------------------------------------------------------------------------- layouts

@@ -275,7 +275,8 @@ def _missing_mend(path: Path) -> str:
     if "\\" in path.name:
         return "write / for \\ in its path"
     # NeRF's synthetic scenes leave the suffix out.
-    given = next((name for suffix in (".png", ".jpg") if (name := path.with_name(path.name + suffix)).is_file()), None)
+    names = [path.with_name(path.name + suffix) for suffix in (".png", ".jpg")]
+    given = next((name for name in names if os.path.isfile(name)), None)
     return f"write {given.suffix} after its path" if given is not None else "add it or correct its path"
 
 
@@ -289,9 +290,9 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
     if width * height > _MOST_PIXELS:
         found = f"the image has more than {_MOST_PIXELS >> 20} mega pixels"
         raise CaptureError(path, found, "scale it down, and its intrinsics with it")
-    # OpenCV fills the missing part of a cut-off JPEG with grey; its end marker must follow the last scan's start. Of a
+    # OpenCV fills the missing part of a cut-off JPEG with grey; its end marker must follow the first scan's start. Of a
     # cut-off PNG libpng writes lines of its own.
-    cut_off = data.startswith(_JPEG) and data.find(b"\xff\xd9", max(data.rfind(b"\xff\xda"), 0)) < 0
+    cut_off = data.startswith(_JPEG) and data.find(b"\xff\xd9", _first_scan(data)) < 0
     cut_off |= data.startswith(_PNG) and _PNG_END not in data
     try:
         known = width > 0 and not cut_off
@@ -301,6 +302,14 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
     if pixels is None:
         raise CaptureError(path, "the image is cut off, damaged or of an unknown kind", "copy or export it again")
     return pixels
+
+
+def _first_scan(data: bytes) -> int:
+    """Where the first scan of a JPEG starts: what comes before may hold a small picture with an end of its own."""
+    at = 2
+    while data[at : at + 1] == b"\xff" and data[at : at + 2] != b"\xff\xda":
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return at
 
 
 def _palette_indices(path: Path, data: bytes, shown: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import stat
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -171,6 +172,8 @@ def _copy(source: Path, target: Path, output_dir: Path) -> None:
         shutil.copytree(source, target, ignore=left_out, dirs_exist_ok=True)
     except shutil.Error as error:
         raise InputError(f"{error.args[0][0][0]}: cannot be copied; make it readable, and room on the disk.") from None
+    for folder in (target, *(path for path in target.rglob("*") if path.is_dir())):
+        folder.chmod(folder.stat().st_mode | stat.S_IRWXU)  # as read-only as those of the source
     for file in sorted(target.rglob("transforms*.json")):
         _name_own_files(file, source, target)
 

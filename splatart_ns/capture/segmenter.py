@@ -126,7 +126,9 @@ class Sam:
         try:
             from transformers import AutoModelForMaskGeneration, AutoProcessor
         except ImportError:
-            raise InputError("Segmenting needs transformers; install it with `pip install splatart-ns[sam]`.") from None
+            raise InputError(
+                "Segmenting needs transformers; install it with `pip install 'splatart-ns[sam]'`."
+            ) from None
         options = {"local_files_only": True, "trust_remote_code": False}
         try:
             self._processor = AutoProcessor.from_pretrained(model, **options)

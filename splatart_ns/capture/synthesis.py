@@ -52,9 +52,12 @@ def synthesize(urdf: Path, output_dir: Path, options: SynthesisOptions | None = 
     with new_folder(output_dir) as folder:
         for k, values in enumerate(scene.configurations):
             _write_state(folder / f"state_{k:02d}", scene, values, options, options.train_views, k)
-        _write_state(folder / "eval" / "novel_00", scene, scene.novel, options, 0, len(scene.configurations))
+        if options.test_views > 0:
+            _write_state(folder / "eval" / "novel_00", scene, scene.novel, options, 0, len(scene.configurations))
         _write_points(folder / "ground_truth_points", scene, options.seed)
         truth = ground_truth(scene, options.fov_degrees, options.resolution, options.length_unit, POINTS_PER_PART)
+        if options.test_views == 0:
+            truth["novel"] = []
         text = json.dumps(truth, indent=1)
         (folder / "ground_truth.json").write_text(text + "\n", encoding="utf-8")
     return output_dir
@@ -105,6 +108,8 @@ def _assignments(text: str, robot: Robot) -> dict[str, float]:
             raise InputError(
                 f"{robot.path}: joint {name!r} cannot be at {value:g}; its limits are {low:g} to {high:g}."
             )
+        if name in values:
+            raise InputError(f"The joint {name!r} has two values; leave out one of them.")
         values[name] = value
     return values
 

@@ -9,6 +9,8 @@ from splatart_ns.choices import Views
 
 MOST_PIXELS = 16384
 """Along a side of an image that is made."""
+MOST_STATES = 100_000
+"""Of a dataset."""
 OBJECTS = ("hinge", "drawer", "arm")
 """The names of the built-in objects."""
 

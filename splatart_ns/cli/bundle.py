@@ -88,6 +88,14 @@ class Export:
         formats = tuple(dict.fromkeys(sum(self.format, ())))
         if not formats:
             raise InputError(f"--format names none; give one or more of {', '.join(get_args(Format))}.")
+        for option, nothing_to in (
+            ("scale", {"html"}),
+            ("density", {"html", "ply"}),
+            ("limit_margin", {"html", "ply"}),
+        ):
+            if getattr(self, option) != type(self).__dataclass_fields__[option].default and set(formats) <= nothing_to:
+                name = option.replace("_", "-")
+                raise InputError(f"--{name} changes nothing of {' and '.join(formats)}; leave it out.")
         # What cannot be written is said before the meshes are made.
         exports.require(formats)
         folders = {form: self.bundle / "export" / form if self.output is None else self.output for form in formats}

@@ -10,7 +10,7 @@ import tyro
 
 from splatart_ns.capture.synthesis_options import SynthesisOptions
 from splatart_ns.cli.common import choose_rasterizer, device
-from splatart_ns.errors import InputError
+from splatart_ns.errors import InputError, printable
 
 
 @dataclass
@@ -68,7 +68,7 @@ class Import:
             print(f"Labels: {done.format}, {done.labelled} of {done.frames} frames; parts: {', '.join(done.parts)}")
             if done.unmatched:
                 names = ", ".join(done.unmatched[:3]) + (", ..." if len(done.unmatched) > 3 else "")
-                print(f"No frame has the name of {len(done.unmatched)} labelled images: {names}")
+                print(f"No frame has the name of {len(done.unmatched)} labelled images: {printable(names)}")
         print(f"Capture: {self.output_dir or self.sources[0]}")
 
 

@@ -36,7 +36,8 @@ class Fit:
     motion gave each its own scale. The states are brought into the world of the first by the part --root, or one that
     is chosen. By default what the capture says."""
     refine_cameras: RefineCameras = "auto"
-    """Whether to correct the cameras' poses; auto does where the silhouettes contradict each other."""
+    """Whether to correct the cameras' poses; auto does where the silhouettes contradict each other; where images have
+    none it always tries, and keeps what moves the images by 0.7 pixels or more."""
     downscale: int | None = None
     """How many times smaller than they are to look at images: 1 at all their pixels. By default so that no more than
     800 are left along the longer side, with --quality high 1600; a draft takes half of these, if that leaves 128."""

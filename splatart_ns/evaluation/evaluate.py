@@ -17,7 +17,7 @@ from splatart_ns.capture.digest import capture_identity, is_another
 from splatart_ns.capture.formats import load_capture, load_novel
 from splatart_ns.capture.view import load_views
 from splatart_ns.errors import InputError
-from splatart_ns.evaluation.geometry import chamfer_centres, chamfer_mesh
+from splatart_ns.evaluation.geometry import SAMPLES, chamfer_centres, chamfer_mesh
 from splatart_ns.evaluation.ground_truth import GroundTruth, load_ground_truth
 from splatart_ns.evaluation.held_out import fitted_residuals, held_out_scores
 from splatart_ns.evaluation.images import image_scores, is_mapped, novel_motions
@@ -106,6 +106,12 @@ def _score_model(
     metrics["parts"] = part_pose_errors(truth, bundle)
     metrics["geometry"]["centres"] = chamfer_centres(truth, bundle)
     metrics["geometry"]["mesh"] = chamfer_mesh(truth, bundle)
+    for of, figures in metrics["geometry"].items():
+        if lost := [name for name, value in figures["parts"].items() if value is None]:
+            notes.append(f"geometry.{of}: nothing is shown of {', '.join(lost)}; means that it belongs to are null")
+    few = [name for part, name in truth.parts.items() if len(truth.points[part]) < SAMPLES]
+    if few:
+        notes.append(f"geometry: of {', '.join(few)} the truth has fewer than {SAMPLES} points: figures are larger so")
 
 
 def _score_images(

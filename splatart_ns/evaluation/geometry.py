@@ -108,10 +108,10 @@ def _chamfers(
             for part, name in ground_truth.parts.items()
         }
         moving = [parts[name] for part, name in ground_truth.parts.items() if part != ground_truth.root]
-        found = [value for value in moving if value is not None]
         return {
             "CD-s": parts[ground_truth.parts[ground_truth.root]],
-            "CD-m": sum(found) / len(found) if found else None,
+            # Without a part that it lost an estimate would seem the better.
+            "CD-m": sum(moving) / len(moving) if moving and None not in moving else None,
             "CD-w": chamfer(
                 np.concatenate([at(whole[whole_part == part], motions[part]) for part in sampled]),
                 np.concatenate([at(true_whole[true_whole_part == part], true_motions[part]) for part in true_points]),

@@ -48,6 +48,7 @@ def image_scores(
 
     Image scores are means over the views, on white: over those that say where the object ends, by alpha or labels;
     where none does, colours are compared within the silhouette that is rendered. `silhouette`: "given" or "rendered".
+    What a view's mask leaves out does not count.
     A part's IoU counts the pixels of all labelled views together, and `part_iou` is the mean over the parts, of the
     capture or the bundle, that any of them shows or predicts.
     """
@@ -73,12 +74,12 @@ def image_scores(
             continue
         image = (rendering.rgb[0].cpu() + (1 - accumulation) * white).clamp(0, 1)
         truth = (given or replace(view, alpha=shown)).rgb_on(white)
-        counts = torch.ones_like(shown, dtype=torch.bool)
+        counts = torch.ones_like(shown, dtype=torch.bool) if view.mask is None else view.mask
         if given is not None and view.alpha is None:  # labels may leave open whose a pixel is
-            counts = view.labels != UNLABELLED
-            if not counts.any():
-                continue
-            truth = torch.where(counts[..., None], truth, image)
+            counts = counts & (view.labels != UNLABELLED)
+        if not counts.any():
+            continue
+        truth = torch.where(counts[..., None], truth, image)
         per_view["psnr"].append(psnr(image[counts], truth[counts]))
         per_view["ssim"].append(float(ssim(image, truth)))
         if given is not None:

@@ -78,7 +78,8 @@ class SemanticModelConfig(SplatartModelConfig):
     silhouettes, and 3 / 2 of those that start on the surroundings."""
     background_color: Literal["random", "black", "white"] = "random"
     refine_cameras: RefineCameras = "auto"
-    """Whether the cameras' poses are refined while geometry and colour learn; auto: if no hull fits the images."""
+    """Whether the cameras' poses are refined while geometry and colour learn; auto: if no hull fits the silhouettes;
+    where images have none it always tries, and goes on if that moves the images by 0.7 pixels or more."""
 
 
 class SemanticModel(SplatartModel):

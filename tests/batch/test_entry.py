@@ -166,6 +166,7 @@ def test_a_manifest_with_a_mistake_names_the_line_and_the_mend(make, tmp_path, t
         r'{"path": "a\ud800", "name": "a"}',
         '{"path": "a", "joints": "lid"}',
         '{"path": "a", "seed": true}',
+        '{"path": "a", "path": "b"}',
     ],
 )
 def test_a_line_that_is_no_object_or_has_a_wrong_value_is_named(make, tmp_path, line):

@@ -150,7 +150,7 @@ def test_shards_that_fewer_images_would_leave_behind_are_refused(bundles, tmp_pa
     assert (tmp_path / "shard-000002/images.tar").exists()
 
 
-@pytest.mark.parametrize("options", [{"images": 0}, {"shard_size": 0}, {"states": 0}])
+@pytest.mark.parametrize("options", [{"images": 0}, {"shard_size": 0}, {"states": 0}, {"states": 10**6}])
 def test_options_without_sense_are_mistakes(bundles, options):
     with pytest.raises(InputError, match=f"--{next(iter(options)).replace('_', '-')}"):
         Shards(str(bundles), ["a"], ShardOptions(**({"images": 10} | options)))

@@ -69,6 +69,16 @@ def test_loops_name_the_parts_around_them(assembled):
     assert [j.name for j in assembled.joints if not j.in_tree] == ["body_to_knob"]
 
 
+def test_joints_whose_parts_names_read_alike_have_names_of_their_own(bundle, tmp_path):
+    told = assemble(bundle, {1: "a", 2: "b_to_c", 3: "a_to_b_to_c", 4: "c"})
+    assert [joint.name for joint in told.joints] == ["a_to_b_to_c_joint", "b_to_c_to_a_to_b_to_c", "a_to_a_to_b_to_c"]
+    told = assemble(bundle, {1: "a", 2: "a_to_b", 3: "b_to_a_to_b", 4: "c"})
+    names = [joint.name for joint in told.joints]
+    assert len(set(names)) == 3 and told.loops[0]["joint"] == names[2]
+    save_bundle(told, tmp_path)
+    assert [j.name for j in load_bundle(tmp_path).joints] == names
+
+
 def test_what_is_assembled_is_a_valid_bundle(assembled, tmp_path):
     save_bundle(assembled, tmp_path)
     assert [j.name for j in load_bundle(tmp_path).tree_joints] == ["body_to_door", "door_to_knob"]

@@ -86,6 +86,11 @@ BAD_EXPORTS = {
     "damaged runs": (segmentation({"size": [16, 16], "counts": "\u00e9"}), "damaged"),
     "runs cut off": (segmentation({"size": [16, 16], "counts": "o"}), "cut off"),
     "runs of endless numbers": (segmentation({"size": [16, 16], "counts": "o" * 10**5}), "damaged"),
+    "two categories of one id": (
+        change_coco(lambda e: e["categories"].append(dict(e["categories"][0]))),
+        "there twice",
+    ),
+    "two images of one id": (change_coco(lambda e: e["images"].append(dict(e["images"][0]))), "id 1 of an image"),
     "unknown category": (change_coco(lambda e: e["annotations"][0].update(category_id=9)), "category_id 9"),
     "unknown image": (change_coco(lambda e: e["annotations"][0].update(image_id=99)), "image_id 99"),
     "no annotations": (change_coco(lambda e: e.update(annotations=[])), "labels no image"),

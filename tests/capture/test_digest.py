@@ -24,6 +24,11 @@ def move(meta):
     meta["frames"][0]["transform_matrix"][0][3] += 1e-3
 
 
+def test_a_state_may_have_any_name_that_a_folder_can_have(capture_folder):
+    (capture_folder / "state_01").rename(capture_folder / os.fsdecode(b"state_\xff1"))
+    assert len(capture_digest(load_capture(capture_folder))) == 64
+
+
 SEEN = {
     "an image": lambda folder, edit: change_image(folder / "state_01/images/0000.png", 7),
     "labels": lambda folder, edit: change_image(folder / "state_01/labels/0000.png", 2),

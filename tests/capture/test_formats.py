@@ -192,6 +192,16 @@ def test_optional_files_and_points_are_found(capture_folder, edit):
     assert [p.name for p in found] == ["o.png", "m.png", "d.npy"]
 
 
+@pytest.mark.parametrize(
+    "key, first, other", [("length_unit", "metre", "mm"), ("length_unit", "metre", 5), ("worlds", "similar", "shared")]
+)
+def test_what_all_states_share_cannot_differ(capture_folder, edit, key, first, other):
+    for state, value in (("state_00", first), ("state_01", other)):
+        edit(capture_folder / state / "transforms.json", lambda meta, value=value: meta.update({key: value}))
+    with pytest.raises(InputError, match=f'state_01/transforms.json: "{key}" is '):
+        load_capture(capture_folder)
+
+
 @pytest.mark.parametrize("blank", ["", "  "])
 def test_a_blank_unit_of_length_is_none(capture_folder, edit, blank):
     edit(capture_folder / FILE, lambda meta: meta.update(length_unit=blank))

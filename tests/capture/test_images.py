@@ -63,6 +63,22 @@ def test_a_cut_off_image_is_an_input_error_and_no_more_is_written(tmp_path, capf
     assert capfd.readouterr().err == ""
 
 
+def test_a_film_behind_a_picture_does_not_make_it_cut_off(tmp_path):
+    """Phones append one, whose bytes may be any."""
+    pixels = np.full((32, 32, 3), 90, np.uint8)
+    path = write(tmp_path / "a.jpg", pixels)
+    whole = path.read_bytes()
+    path.write_bytes(whole + b"\0ftypmp42\xff\xda\0")
+    assert abs(read_image(path).astype(int) - 90).max() < 3
+    # A small picture in the header has an end, too; it is not the picture's.
+    thumbnail = b"\xff\xe1" + (2 + len(whole)).to_bytes(2, "big") + whole
+    path.write_bytes(whole[:2] + thumbnail + whole[2:])
+    assert abs(read_image(path).astype(int) - 90).max() < 3
+    path.write_bytes(whole[:2] + thumbnail + whole[2:-40])
+    with pytest.raises(InputError, match="cut off"):
+        read_image(path)
+
+
 def test_a_missing_file_a_folder_and_a_stranger_are_input_errors(tmp_path):
     (tmp_path / "text.png").write_text("no image")
     for name in ("nothing.png", ".", "text.png"):

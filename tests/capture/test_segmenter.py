@@ -93,7 +93,7 @@ def test_prompts_that_make_no_sense_are_named(capture, tmp_path, content, words)
 
 @pytest.mark.skipif(importlib.util.find_spec("transformers") is not None, reason="transformers is installed")
 def test_without_transformers_one_sentence_says_what_to_install():
-    with pytest.raises(InputError, match=r"pip install splatart-ns\[sam\]"):
+    with pytest.raises(InputError, match=r"pip install 'splatart-ns\[sam\]'"):
         Sam()
 
 

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from splatart_ns.capture.formats import load_capture
+from splatart_ns.capture.formats import load_capture, load_novel
 from splatart_ns.capture.scene import camera_poses
 from splatart_ns.capture.synthesis import synthesize
 from splatart_ns.capture.synthesis_options import SynthesisOptions
@@ -186,6 +186,13 @@ def test_given_joint_values_are_used(urdf, tmp_path):
     truth = read(synthesize(urdf, tmp_path / "c", options), "ground_truth.json")
     assert [j["values"] for j in truth["joints"]] == [[0.1, 0.2, 0.0], [-0.5, 0.0, 0.0], [0.0, 0.0, 3.0]]
     assert (tmp_path / "c" / "state_02" / "transforms.json").is_file()
+    assert truth["novel"] == [] and not load_novel(tmp_path / "c")  # which would have no frames
+
+
+def test_a_joint_has_one_value_a_state(urdf, tmp_path):
+    options = replace(SMALL, joint_values=("lift=0.1, lift=0.2", "lift=0"))
+    with pytest.raises(InputError, match="'lift' has two values"):
+        synthesize(urdf, tmp_path / "c", options)
 
 
 def test_a_frozen_joint_joins_its_links(urdf, tmp_path):

@@ -61,7 +61,7 @@ def test_a_missing_part_is_null(truth, bundle):
     bundle.parts.pop(2)
     values = chamfer_centres(truth, bundle)
     assert values["parts"]["latch"] is None
-    assert values["CD-m"] == values["parts"]["door"]
+    assert values["parts"]["door"] == 0 and values["CD-m"] is None  # it would seem the better for it
 
 
 def test_the_mesh_is_scored_at_both_ends(truth, bundle):
@@ -89,4 +89,4 @@ def test_a_part_that_nobody_sees_has_no_mesh(truth, bundle):
     bundle.parts[2].splat.opacity_logits[:] = -10
     values = chamfer_mesh(truth, bundle)
     assert values["parts"]["latch"] is None
-    assert values["CD-m"] == values["parts"]["door"]
+    assert values["parts"]["door"] > 0 and values["CD-m"] is None

@@ -71,6 +71,18 @@ def test_labels_are_silhouettes_and_unlabelled_pixels_do_not_count(bundle, captu
     assert moved["psnr"] < scores["psnr"] - 3 and moved["accumulation_l1"] > 2 * scores["accumulation_l1"]
 
 
+def test_what_a_mask_leaves_out_of_a_view_does_not_count(bundle, capture):
+    views = load_views(load_capture(capture), load_capture(capture).states[0], "test")
+    top = torch.arange(views[0].height)[:, None].expand(-1, views[0].width) < views[0].height // 2
+    hand = [replace(v, rgb=v.rgb.where(~top[..., None], 9), alpha=v.alpha.where(~top, 255)) for v in views]
+    kept, at_first = [replace(view, mask=~top) for view in hand], observed_motions(bundle, 0)
+    spoilt, whole, masked = (image_scores(bundle, at_first, of, load_capture(capture))[0] for of in (hand, views, kept))
+    assert spoilt["psnr"] < 20 < whole["psnr"] - 3 < masked["psnr"]
+    assert masked["accumulation_l1"] < 1.5 * whole["accumulation_l1"] < spoilt["accumulation_l1"]
+    nothing = [replace(view, mask=torch.zeros_like(top)) for view in views]
+    assert image_scores(bundle, at_first, nothing, load_capture(capture))[0]["psnr"] is None
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_true_change_takes_the_sign_of_the_estimate(truth, bundle, sign):
     bundle.joints[0].values *= sign

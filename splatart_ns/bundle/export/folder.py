@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from splatart_ns.errors import InputError
-from splatart_ns.files import errors_about, write_json
+from splatart_ns.files import errors_about, put_in_place, scratch_folder, write_json
 from splatart_ns.records import read_record
 
 MANIFEST = "export.json"
@@ -27,16 +26,18 @@ def export_folder(path: Path, about: dict) -> Iterator[Path]:
     """
     path = Path(path).resolve()
     check_folder(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent) as scratch:
+    with scratch_folder(path) as scratch:
         fresh = Path(scratch) / "new"
         fresh.mkdir()
         with errors_about(path, fresh):
             yield fresh
         write_json(fresh / MANIFEST, {"format": FORMAT, **about, "files": sorted(_files(fresh))})
-        if path.exists():
+        if path.is_mount():
+            for name in _files(path):
+                (path / name).unlink()
+        elif path.exists():
             os.replace(path, Path(scratch) / "old")
-        os.replace(fresh, path)
+        put_in_place(fresh, path)
 
 
 def check_folder(path: Path) -> None:

@@ -57,6 +57,13 @@ def format_notes(robot: Robot, form: Format) -> list[str]:
     for loop in robot.loops:
         if form == "urdf":
             notes.append(f"Joint '{loop.name}' closes a loop, which URDF does not have: left out.")
+        elif form == "glb":
+            notes.append(f"Joint '{loop.name}' closes a loop, which GLB does not have: left out.")
+        elif form == "usd" and loop.type == "screw":
+            notes.append(
+                f"Joint '{loop.name}' closes a loop and is a screw, which UsdPhysics cannot say: in the file it turns "
+                "and slides freely."
+            )
         elif loop.type == "free":
             notes.append(f"Joint '{loop.name}' closes a loop and is free, which holds nothing: left out.")
     if form == "usd":

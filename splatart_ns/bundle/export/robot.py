@@ -128,8 +128,8 @@ class Robot:
     @property
     def uncollided(self) -> list[tuple[str, str]]:
         """Pairs of links that must not collide: neighbours touch at their joint, and others overlap at rest."""
-        neighbours = [(joint.parent, joint.child) for joint in self.joints]
-        return neighbours + [pair for pair in self.overlaps if pair not in neighbours]
+        neighbours = [(joint.parent, joint.child) for joint in (*self.joints, *self.loops)]
+        return list({frozenset(pair): pair for pair in (*neighbours, *self.overlaps)}.values())
 
     @property
     def size(self) -> float:

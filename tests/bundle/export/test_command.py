@@ -88,6 +88,12 @@ def test_numbers_that_make_no_sense_are_refused(run_main, folder, option, value)
     assert errors.startswith(f"error: --{option} is ") and "; give a number " in errors
 
 
+@pytest.mark.parametrize(("form", "option"), [("html", "scale"), ("html", "density"), ("ply", "limit-margin")])
+def test_options_that_change_nothing_are_refused(run_main, folder, form, option):
+    code, _, errors = run_main("export", folder, "--format", form, f"--{option}", 0.5)
+    assert code == 2 and f"error: --{option} changes nothing of {form}; leave it out." in errors
+
+
 def test_what_cannot_be_written_is_said_before_any_mesh_is_made(run_main, folder, tmp_path, monkeypatch):
     monkeypatch.setattr(exports, "part_shapes", lambda bundle: pytest.fail("made meshes"))
     (tmp_path / "out" / "glb").mkdir(parents=True)

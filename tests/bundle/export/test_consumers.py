@@ -4,6 +4,7 @@ import dataclasses
 import gc
 import json
 import logging
+import re
 import sys
 import warnings
 from unittest.mock import Mock
@@ -76,7 +77,7 @@ def test_one_part_alone(objects, tmp_path, form):
     assert_good(validate(export(bundle, robot, form, tmp_path / "out"), form, bundle, robot))
 
 
-@pytest.mark.parametrize("form", ["urdf", "mjcf", "usd"])
+@pytest.mark.parametrize("form", ["urdf", "mjcf", "usd", "glb"])
 def test_loops_are_written_or_noted(objects, tmp_path, form):
     if form in NEEDS:
         pytest.importorskip(NEEDS[form])
@@ -85,14 +86,16 @@ def test_loops_are_written_or_noted(objects, tmp_path, form):
     robot = objects.robot(bundle)
     path = export(bundle, robot, form, tmp_path / "out")
     notes = " ".join(json.loads((path.parent / "export.json").read_text())["notes"])
-    left_out = {kind for kind in JOINT_DOFS if f"Joint '{kind}_closure' closes a loop" in notes}
+    left_out = {k for k in JOINT_DOFS if re.search(rf"Joint '{k}_closure' closes a loop[^:]*: left out", notes)}
+    assert ("'screw_closure' closes a loop and is a screw" in notes) == (form == "usd")
     if form == "usd":
         stage = pytest.importorskip("pxr.Usd").Stage.Open(str(path))
         written = {k for k in JOINT_DOFS if stage.GetPrimAtPath(f"/thing/joints/{k}_closure").IsValid()}
     else:
-        written = {k for k in JOINT_DOFS if f'"{k}_closure"' in path.read_text()}
-    assert left_out == (set(JOINT_DOFS) if form == "urdf" else {"free"})
+        written = {k for k in JOINT_DOFS if f'"{k}_closure"'.encode() in path.read_bytes()}
+    assert left_out == (set(JOINT_DOFS) if form in ("urdf", "glb") else {"free"})
     assert written == set(JOINT_DOFS) - left_out
+    assert ("p2", "p0") in robot.uncollided
     assert_good([c for c in validate(path, form, bundle, robot) if "gravity" not in c.what])
 
 
