@@ -47,7 +47,8 @@ from splatart_ns.stages.spread import TOLD, spread
 HALF_SIZE = 0.4
 """The share of the first phase that sees images of half the size."""
 LEAST_PIXELS = 256
-"""Images with fewer pixels along a side are always seen at their full size: at this one it was measured."""
+"""Images of fewer pixels along a side than this, as they are in their files, are always seen at the size at which the
+stage looks at them: at this one it was measured."""
 
 EVENED = (0.2, 0.4, 0.6)
 """When frames are brought to one exposure, as shares of the steps on geometry and colour."""
@@ -184,7 +185,7 @@ class SemanticModel(SplatartModel):
 
     @torch.no_grad()
     def fade(self, which: Tensor) -> None:
-        """Make some Gaussians [N] bool transparent: they get pruned."""
+        """Make some Gaussians [N] bool transparent: they do not show, and go by the next pruning, or the next stage."""
         self.gauss_params["opacities"][which.to(self.device)] = -10.0
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:

@@ -66,7 +66,7 @@ class Splat:
     def ends(self, extent: float) -> Tensor:
         """Where Gaussians end [N, 4, 3]: `extent` standard deviations out, both ways along their two longest axes."""
         lengths, order = self.scales.sort(dim=-1, descending=True)
-        axes = matrix_from_quat(F.normalize(self.quats, dim=-1)).mT.gather(1, order[..., None].expand(-1, -1, 3))
+        axes = matrix_from_quat(self.quats).mT.gather(1, order[..., None].expand(-1, -1, 3))
         along = (extent * lengths[..., None] * axes)[:, :2]
         return torch.cat([self.means[:, None] + along, self.means[:, None] - along], 1)
 

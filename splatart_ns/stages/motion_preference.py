@@ -47,9 +47,7 @@ def prefer_slide(T: np.ndarray, cost: np.ndarray, order: list[int], own: float =
     turn = _angles(T)
     times = DOUBTFUL if cost[order[0]] > SUSPECT * own else ALIKE
     slides = [i for i in order if turn[i] < math.radians(SLIDE_TURN) and cost[i] < times * cost[order[0]]]
-    if turn[order[0]] < TURNED_OVER or not slides:
-        return order
-    return [slides[0], *(i for i in order if i != slides[0])]
+    return order if turn[order[0]] < TURNED_OVER else _first(order, slides)
 
 
 def prefer_upright(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]:
@@ -60,9 +58,7 @@ def prefer_upright(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[in
     """
     turn = _angles(T)
     upright = [i for i in order if turn[i] < TURNED_OVER and cost[i] < UPRIGHT * cost[order[0]]]
-    if turn[order[0]] < TURNED_OVER or not upright:
-        return []
-    return [upright[0], *(i for i in order if i != upright[0])]
+    return [] if turn[order[0]] < TURNED_OVER or not upright else _first(order, upright)
 
 
 def prefer_turn(T: np.ndarray, cost: np.ndarray, order: list[int], radius: float) -> list[int]:
@@ -82,7 +78,7 @@ def prefer_turn(T: np.ndarray, cost: np.ndarray, order: list[int], radius: float
     if not PITCHED < shift(best) < np.inf:
         return order
     turns = [i for i in order if shift(i) < UNPITCHED and cost[i] < SIMILAR_TURN * cost[best]]
-    return [*turns[:1], *(i for i in order if i not in turns[:1])]
+    return _first(order, turns)
 
 
 def prefer_less_turn(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[int]:
@@ -99,7 +95,12 @@ def prefer_less_turn(T: np.ndarray, cost: np.ndarray, order: list[int]) -> list[
         (math.pi - HALF_TURN < turn) & (turn < HALF_TURN) & (_angles(T[first, :3, :3].T @ T[:, :3, :3]) > HALF_TURN)
     )
     less = [i for i in order if hinged[i] and cost[i] < DOUBTFUL * cost[first]]
-    return [*less[:1], *(i for i in order if i not in less[:1])]
+    return _first(order, less)
+
+
+def _first(order: list[int], preferred: list[int]) -> list[int]:
+    """The order with the first of those that are preferred, if there is one, before all others."""
+    return [*preferred[:1], *(i for i in order if i not in preferred[:1])]
 
 
 def looks_alike(

@@ -64,7 +64,7 @@ def _weights(splat: Splat, states: Tensor | None) -> csr_matrix:
     the more the surface that they are flat on turns between them. And nothing if they are of different `states` [N]
     and colours."""
     means = splat.means.double().numpy(force=True)
-    R = matrix_from_quat(torch.nn.functional.normalize(splat.quats, dim=-1)).double()
+    R = matrix_from_quat(splat.quats).double()
     thin = splat.log_scales.argmin(-1)
     normals = R.mT[torch.arange(len(splat), device=thin.device), thin].numpy(force=True)
     k = min(NEIGHBOURS if states is None else 2 * NEIGHBOURS, len(means) - 1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from splatart_ns.geometry.se3 import matrix_from_quat, so3_exp
@@ -49,7 +48,7 @@ def _principal_axes(splat: Splat) -> tuple[Tensor, Tensor]:
         return x[:0], torch.zeros(0, dtype=torch.bool, device=x.device)
     x = x - weight @ x / weight.sum()
     # The centres alone tell little of a rod that is a few pixels thick: half of its thickness is the Gaussians' own.
-    extents = matrix_from_quat(F.normalize(splat.quats.double(), dim=-1)) * splat.scales.double()[:, None]
+    extents = matrix_from_quat(splat.quats.double()) * splat.scales.double()[:, None]
     spread = x[:, :, None] * x[:, None] + extents @ extents.mT
     moments, axes = torch.linalg.eigh((weight[:, None, None] * spread).sum(0) / weight.sum())
     across = torch.stack([moments[[1, 2]], moments[[0, 2]], moments[[0, 1]]])
