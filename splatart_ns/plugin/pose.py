@@ -6,7 +6,7 @@ import random
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,6 +31,7 @@ from splatart_ns.plugin.trainer import LaterPipelineConfig
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.flush import border_against_others
+from splatart_ns.stages.free_space import FreeSpace, strays
 from splatart_ns.stages.image_error import image_error
 from splatart_ns.stages.initial_motion import InitialMotion, initial_motion
 from splatart_ns.stages.merge import merge_parts
@@ -387,6 +388,7 @@ class PosePipeline(VanillaPipeline):
         def finish(step: int) -> None:
             if step == steps - 1:
                 self.model.poses.commit(self.model.poses.T())
+                self._remove_strays(optimizers)  # some have gone there since the last thinning
                 self._tell_errors()
 
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
@@ -452,28 +454,48 @@ class PosePipeline(VanillaPipeline):
 
     @torch.no_grad()
     def _thin(self, turn: int, optimizers: Optimizers) -> None:
-        """One of the rounds in which merged Gaussians go that the images hardly miss, and veils."""
+        """One of the rounds in which merged Gaussians go that the images hardly miss, veils, and strays."""
         start, model = time.perf_counter(), self.model
-        found = self._absences(turn)
         if turn == 0:
-            self._error = found.error
             self.findings["thinned"] = {
                 "gaussians": [model.num_points] * 2,
                 "veils": 0,
+                "strays": 0,
                 "added_error": 0.0,
                 "seconds": 0.0,
             }
+        self._remove_strays(optimizers)
+        found = self._absences(turn)
+        if turn == 0:
+            self._error = found.error
         told = self.findings["thinned"]
         budget = (turn + 1) / ROUNDS * BUDGET - told["added_error"]
         veil = veils(found, model.splat.detach())
         missed = found.images.masked_fill(veil, 0.0)  # what shows behind them learns to be what it is
         goes = expendable(missed, model.splat.part_ids, budget * self._error)
-        remove(model.gauss_params, {name: optimizers.optimizers[name] for name in model.gauss_params}, {}, goes)
-        model.state_ids = model.state_ids[~goes]
-        told["gaussians"][1] = model.num_points
+        self._remove(goes, optimizers)
         told["veils"] += int((veil & goes).sum())
         told["added_error"] += float(missed[goes].sum()) / self._error
         told["seconds"] = round(told["seconds"] + time.perf_counter() - start, 2)
+
+    def _remove(self, goes: Tensor, optimizers: Optimizers) -> None:
+        """Some of the merged Gaussians [N] bool, and what the optimisers know of them."""
+        model = self.model
+        remove(model.gauss_params, {name: optimizers.optimizers[name] for name in model.gauss_params}, {}, goes)
+        model.state_ids = model.state_ids[~goes]
+        self.findings["thinned"]["gaussians"][1] = model.num_points
+
+    @torch.no_grad()
+    def _remove_strays(self, optimizers: Optimizers) -> None:
+        model = self.model
+        known = model.covariance.isfinite().flatten(2).all(-1)
+        stray = strays(model.splat, self._free, model.poses.T(), known)
+        self._remove(stray, optimizers)
+        self.findings["thinned"]["strays"] += int(stray.sum())
+
+    @cached_property
+    def _free(self) -> list[FreeSpace]:
+        return [FreeSpace.of(views) for views in self.views]
 
     def _absences(self, turn: int) -> Absences:
         """What `absences` finds in some views of all states, others in each turn."""

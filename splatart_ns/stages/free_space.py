@@ -16,13 +16,17 @@ from torch import Tensor
 
 from splatart_ns.capture.hull import project
 from splatart_ns.capture.view import View, evenly
-from splatart_ns.geometry.se3 import inverse
+from splatart_ns.geometry.se3 import inverse, transform_points
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.part_pair import PartPair
 from splatart_ns.stages.visibility import MAX_VIEWS
 
 EXTENT = 2.0
 """How far out a Gaussian must be clear of the background, in standard deviations."""
+OFTEN = 0.1
+"""What a larger share of a state's views show in its free space is not there."""
+FEW = 0.1
+"""Where a larger share of a part's Gaussians is not there, its pose is rather wrong, or the silhouettes are."""
 MOST = 0.5
 """Where more than this share of a part's Gaussians reach into the background, its motion is not about right."""
 
@@ -58,6 +62,36 @@ class FreeSpace:
             column, row, _, inside = project(view, ends)
             reached |= inside & empty[row, column]
         return reached.any(1)
+
+    def holds(self, points: Tensor) -> Tensor:
+        """Which points [N, 3] `OFTEN` show in it [N] bool."""
+        times = torch.zeros(len(points), device=points.device)
+        for view, empty in zip(self.views, self.empty, strict=True):
+            column, row, _, inside = project(view, points)
+            times += inside & empty[row, column]
+        return times > OFTEN * len(self.views)
+
+
+def strays(splat: Splat, free: Sequence[FreeSpace], T: Tensor, known: Tensor) -> Tensor:
+    """Which Gaussians [N] bool of a labelled splat in the canonical frame some state's views show in free space.
+
+    A drawer that is open in one state hides in its cabinet what is wrongly its own there; once it is shut, that sticks
+    out at the back.
+
+    Args:
+        free: Of each state.
+        T: Poses of parts 1..P [S, P, 4, 4].
+        known: Which of them were found [S, P] bool. Nor are those believed that bring more than a `FEW` there.
+    """
+    found = torch.zeros(len(splat), dtype=torch.bool, device=splat.means.device)
+    for of_state, poses, told in zip(free, T.to(splat.means), known.tolist(), strict=True):
+        for p in range(len(poses)):
+            own = (splat.part_ids == p + 1).nonzero()[:, 0]
+            if told[p] and len(own):
+                stray = of_state.holds(transform_points(poses[p], splat.means[own]))
+                if stray.float().mean() <= FEW:
+                    found[own[stray]] = True
+    return found
 
 
 def without_haze(pair: PartPair, T: Tensor, free: tuple[FreeSpace, FreeSpace]) -> PartPair:

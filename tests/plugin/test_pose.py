@@ -13,7 +13,7 @@ from splatart_ns.capture.formats import load_capture
 from splatart_ns.errors import InputError
 from splatart_ns.geometry.se3 import se3_exp, so3_log
 from splatart_ns.method_configs.pose import method as pose_method
-from splatart_ns.plugin.pose import MOST, RATES
+from splatart_ns.plugin.pose import MOST, RATES, THINNING_PARTS
 from splatart_ns.plugin.semantic_run import read_state
 from splatart_ns.stages.initial_motion import InitialMotion
 from splatart_ns.stages.thinning import BUDGET, LARGEST_SHARE, ROUNDS
@@ -272,12 +272,25 @@ def test_veils_go_first_and_take_nothing_of_the_budget(pose_trainer, monkeypatch
     missed_most = torch.zeros_like(found.images, dtype=torch.bool)
     missed_most[found.images.argsort()[-few:]] = True
     monkeypatch.setattr("splatart_ns.plugin.pose.veils", lambda *_: missed_most)
+    monkeypatch.setattr("splatart_ns.plugin.pose.strays", lambda splat, *_: torch.zeros(len(splat), dtype=torch.bool))
     kept = pipeline.model.means.detach()[~missed_most]
     pipeline._thin(0, trainer.optimizers)
     told = pipeline.findings["thinned"]
     assert told["veils"] == few and 0 < told["added_error"] <= BUDGET / ROUNDS
     left = {tuple(x) for x in pipeline.model.means.tolist()}
     assert left < {tuple(x) for x in kept.tolist()}
+
+
+def test_strays_go_in_every_round_and_in_the_end(pose_trainer, monkeypatch):
+    def first(splat, *_):
+        return torch.arange(len(splat)) == 0
+
+    monkeypatch.setattr("splatart_ns.plugin.pose.strays", first)
+    trainer = pose_trainer(steps=THINNING_PARTS, pose_steps=0, init="centroids")
+    trainer.train()
+    told = trainer.pipeline.findings["thinned"]
+    assert told["strays"] == ROUNDS + 1
+    assert told["gaussians"][1] == trainer.pipeline.model.num_points == len(trainer.pipeline.model.state_ids)
 
 
 @pytest.mark.parametrize(

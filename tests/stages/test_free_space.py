@@ -8,7 +8,7 @@ from part_scene import box, motion, photograph
 from splatart_ns.geometry.se3 import inverse, se3_log
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import pose_evidence
-from splatart_ns.stages.free_space import FreeSpace, without_haze
+from splatart_ns.stages.free_space import FreeSpace, strays, without_haze
 from splatart_ns.stages.part_pair import part_pair
 from splatart_ns.stages.pose_evidence import refine_poses
 
@@ -114,3 +114,23 @@ def test_haze_at_one_edge_pulls_no_part(scene, monkeypatch):
     clear = error()
     monkeypatch.setattr(pose_evidence, "without_haze", lambda pair, T, free: pair)
     assert clear < 0.5 * error()
+
+
+def test_what_one_state_hides_and_another_shows_in_free_space_is_a_stray():
+    """A drawer's tail lies in its cabinet while it is open, and sticks out behind once it is shut."""
+    shut = motion((0, 0, 0), (0.0, 0.5, 0.0))
+    cabinet, drawer = box(1, (0.6, 0.9, 0.5), (0.0, 0.0, 0.0)), box(2, (0.4, 0.4, 0.3), (0.0, -0.5, 0.0))
+    tail = box(2, (0.3, 0.06, 0.2), (0.0, 0.15, 0.0))
+    tail = tail.select(torch.arange(0, len(tail), len(tail) // 12))
+    poses = torch.eye(4).double().repeat(2, 2, 1, 1)
+    poses[1, 1] = shut
+    views = [photograph(Splat.cat([cabinet, drawer.transformed(T)]), 24, 96) for T in (torch.eye(4).double(), shut)]
+    free, known = [FreeSpace.of(of_state) for of_state in views], torch.ones(2, 2, dtype=torch.bool)
+    splat = Splat.cat([cabinet, drawer, tail])
+    found = strays(splat, free, poses, known)
+    assert found[-len(tail) :].all() and not found[: -len(tail)].any()
+    unknown = known.index_put((torch.tensor(1), torch.tensor(1)), torch.tensor(False))
+    assert not strays(splat, free, poses, unknown).any()
+    # A pose that brings a fifth of a part there is not believed.
+    poses[1, 1] = motion((0, 0, 0), (0.3, 0.5, 0.0))
+    assert not strays(splat, free, poses, known).any()
