@@ -5,15 +5,18 @@ import json
 import re
 import subprocess
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 import yourdfpy
+from scipy.spatial.transform import Rotation
 
 from splatart_ns.bundle.export import export, require
 from splatart_ns.bundle.export.colour import linear_from_srgb
+from splatart_ns.bundle.export.robot import DAMPING, EFFORT, FRICTION, GRAVITY, VELOCITY
 from splatart_ns.errors import InputError
 from splatart_ns.splats.ply import read_ply
 
@@ -42,12 +45,44 @@ def test_a_urdf_has_all_that_simulators_ask_for(write):
     moving = [joint for joint in root.findall("joint") if joint.get("type") != "fixed"]
     assert [joint.get("name") for joint in moving] == ["j1", "j2_turn", "j2_slide"]
     for joint in moving:
-        assert {*joint.find("limit").attrib} == {"lower", "upper", "effort", "velocity"}
-        assert {*joint.find("dynamics").attrib} == {"damping", "friction"}
+        limit = {key: float(value) for key, value in joint.find("limit").items()}
+        assert set(limit) == {"lower", "upper", "effort", "velocity"} and limit["lower"] < limit["upper"]
+        assert limit["velocity"] == VELOCITY and limit["effort"] >= EFFORT > VELOCITY
+        dynamics = {key: float(value) for key, value in joint.find("dynamics").items()}
+        assert dynamics == {"damping": DAMPING, "friction": FRICTION}
         axis = np.array(joint.find("axis").get("xyz").split(), float)
         assert np.linalg.norm(axis) == pytest.approx(1, abs=1e-12)
     mimic = root.find("joint[@name='j2_slide']/mimic")
     assert mimic.get("joint") == "j2_turn" and float(mimic.get("multiplier")) == pytest.approx(0.03)
+
+
+def test_masses_are_where_they_are_and_fall_down(objects, tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    bundle = objects.chain(["revolute", "prismatic"])
+    robot, R = objects.robot(bundle), Rotation.from_rotvec([0.4, -0.7, 0.9]).as_matrix()
+    links = {
+        name: replace(
+            link,
+            inertia=replace(link.inertia, centre=np.array([0.01, 0.02, -0.03]), tensor=R @ link.inertia.tensor @ R.T),
+        )
+        for name, link in robot.links.items()
+    }
+    robot = replace(robot, links=links)
+    urdf, mjcf = (export(bundle, robot, form, tmp_path / form) for form in ("urdf", "mjcf"))
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    assert model.opt.gravity.tolist() == [0, 0, -GRAVITY]
+    root = ElementTree.parse(urdf).getroot()
+    for name, link in robot.links.items():
+        inertia, body = link.inertia, model.body(name)
+        own = root.find(f"link[@name='{name}']/inertial")
+        np.testing.assert_allclose(np.array(own.find("origin").get("xyz").split(), float), inertia.centre, atol=1e-9)
+        np.testing.assert_allclose(body.ipos, inertia.centre, atol=1e-9)
+        assert float(own.find("mass").get("value")) == pytest.approx(inertia.mass) == float(body.mass[0])
+        R = Rotation.from_quat(body.iquat, scalar_first=True).as_matrix()
+        np.testing.assert_allclose(R @ np.diag(body.inertia) @ R.T, inertia.tensor, rtol=1e-6, atol=1e-12)
+        told = {key: float(value) for key, value in own.find("inertia").items()}
+        of_file = [told[f"i{a}{b}"] for a, b in ("xx", "xy", "xz", "yy", "yz", "zz")]
+        np.testing.assert_allclose(of_file, inertia.tensor[np.triu_indices(3)], rtol=1e-6, atol=1e-12)
 
 
 def test_mesh_files_are_beside_the_description_and_in_the_links_frame(objects, write):
