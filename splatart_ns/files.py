@@ -64,6 +64,8 @@ def new_folder(path: Path) -> Iterator[Path]:
         raise InputError(f"{given}: cannot be written ({error.strerror}); give another output folder.") from error
     with scratch, errors_about(given, fresh):
         yield fresh
+        if path.exists() and not path.is_mount():
+            path.rmdir()  # which fails where somebody has put something there since
         put_in_place(fresh, path)
 
 
@@ -74,15 +76,22 @@ def scratch_folder(path: Path) -> tempfile.TemporaryDirectory:
     return tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=".tmp", dir=parent)
 
 
-def put_in_place(folder: Path, path: Path) -> None:
-    """Make a folder `path`, which is empty or not there. A mount, which none can replace, gets what is in it."""
+def put_in_place(fresh: Path, path: Path) -> None:
+    """Let a folder in the `scratch_folder` of `path` take its place; what was there goes with the scratch folder.
+
+    A mount, which no other folder can replace, gets what is in that one.
+    """
+    old = fresh.with_name("old")
     if path.is_mount():
-        for inner in folder.iterdir():
-            os.replace(inner, path / inner.name)
+        old.mkdir()
+        for folder, target in ((path, old), (fresh, path)):
+            for inner in folder.iterdir():
+                if inner != fresh.parent:
+                    os.replace(inner, target / inner.name)
         return
     if path.exists():
-        path.rmdir()
-    os.replace(folder, path)
+        os.replace(path, old)
+    os.replace(fresh, path)
 
 
 @contextmanager

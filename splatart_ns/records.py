@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from splatart_ns.errors import InputError
-from splatart_ns.shape import repeated_key
+from splatart_ns.shape import with_keys_once
 
 LONGEST = 1e18
 """Numbers are below it, so that their squares are float32 numbers."""
@@ -112,10 +112,8 @@ def _shown(value: Any) -> str:
 def read_record(path: Path, mend: str) -> Record:
     """The JSON object in a file; `mend` says what to do where there is no such file."""
 
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if (key := repeated_key(pairs)) is not None:
-            raise InputError(f"{path}: an object has the key {_shown(key)} twice; keep one of them")
-        return dict(pairs)
+    def refuse(key: str) -> InputError:
+        return InputError(f"{path}: an object has the key {_shown(key)} twice; keep one of them")
 
     if os.path.exists(path) and not os.path.isfile(path):  # a pipe would never end
         raise InputError(f"{path}: is not a file; {mend}")
@@ -123,7 +121,7 @@ def read_record(path: Path, mend: str) -> Record:
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path}: is larger than {_MOST_BYTES >> 20} MiB; {mend}")
         text = path.read_text(encoding="utf-8-sig")
-        value = json.loads(text, parse_constant=_no_constant, object_pairs_hook=unique)
+        value = json.loads(text, parse_constant=_no_constant, object_pairs_hook=with_keys_once(refuse))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {mend}") from error
     except (ValueError, RecursionError) as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 NUMBER = float
@@ -20,13 +20,18 @@ def parse(data: bytes | None, shape: Any) -> Any | None:
     return value if has_shape(value, shape) else None
 
 
-def repeated_key(pairs: Sequence[tuple[str, Any]]) -> str | None:
-    """The first key that an object has twice, of which `json` would take the last without a word; None for none.
+def with_keys_once(refuse: Callable[[str], Exception]) -> Callable[[Sequence[tuple[str, Any]]], dict[str, Any]]:
+    """An `object_pairs_hook` that raises what `refuse` makes of a key that an object has twice, of which `json` would
+    take the last without a word."""
 
-    For an `object_pairs_hook`.
-    """
-    times = Counter(key for key, _ in pairs)
-    return next((key for key in times if times[key] > 1), None)
+    def unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+        times = Counter(key for key, _ in pairs)
+        for key, count in times.items():
+            if count > 1:
+                raise refuse(key)
+        return dict(pairs)
+
+    return unique
 
 
 def has_shape(value: Any, shape: Any) -> bool:

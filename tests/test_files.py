@@ -78,6 +78,13 @@ def test_a_mount_gets_what_the_new_folder_holds(tmp_path, monkeypatch):
     assert (tmp_path / "out").stat().st_ino == before
 
 
+def test_what_somebody_has_put_there_since_stays(tmp_path):
+    with pytest.raises(OSError, match="not empty"), new_folder(tmp_path / "out"):
+        (tmp_path / "out").mkdir()
+        (tmp_path / "out/theirs").touch()
+    assert (tmp_path / "out/theirs").is_file()
+
+
 def test_a_new_folder_lets_in_whom_the_mask_lets_in(tmp_path):
     before = os.umask(0o027)
     try:

@@ -15,7 +15,7 @@ from typing import Any, get_args
 from splatart_ns.batch.storage import Folder, Storage, join, open_storage, require_folder
 from splatart_ns.choices import Quality, require_downscale, require_seed
 from splatart_ns.errors import InputError
-from splatart_ns.shape import repeated_key
+from splatart_ns.shape import with_keys_once
 
 _TRANSFORMS = "transforms.json"
 _MARKS = (
@@ -148,16 +148,15 @@ def _csv_rows(source: str, text: str) -> Iterable[tuple[int, dict[str, Any]]]:
 
 
 def _json_rows(source: str, text: str) -> Iterable[tuple[int, dict[str, Any]]]:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if (key := repeated_key(pairs)) is not None:
-            raise ValueError(f"an object has the key {key!r} twice")
-        return dict(pairs)
-
     for number, line in enumerate(text.split("\n"), 1):  # texts of JSON may hold other ends of lines
         if not line.strip():
             continue
+
+        def refuse(key: str, number: int = number) -> InputError:
+            return InputError(f"{source}, line {number}: has the key {key!r} twice; keep one of them.")
+
         try:
-            row = json.loads(line, object_pairs_hook=unique)
+            row = json.loads(line, object_pairs_hook=with_keys_once(refuse))
         except (ValueError, RecursionError) as error:
             raise InputError(f"{source}, line {number}: is not JSON ({error}); mend it.") from None
         if not isinstance(row, dict):

@@ -23,7 +23,6 @@ Unreasonable Effectiveness of Quasirandom Sequences, 2018)."""
 _FREE = 0.25
 """How far the values of all states may be shifted, in distances between them: the less, the further two states are
 apart."""
-"""Configurations that there may be."""
 
 
 @dataclass(frozen=True)

@@ -307,8 +307,9 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
 def _first_scan(data: bytes) -> int:
     """Where the first scan of a JPEG starts: what comes before may hold a small picture with an end of its own."""
     at = 2
-    while data[at : at + 1] == b"\xff" and data[at : at + 2] != b"\xff\xda":
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    while data[at : at + 1] == b"\xff" and (marker := data[at + 1 : at + 2]) != b"\xda":
+        # Any number of FF may come before a marker.
+        at += 1 if marker == b"\xff" else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return at
 
 

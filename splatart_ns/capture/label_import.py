@@ -173,7 +173,7 @@ def _copy(source: Path, target: Path, output_dir: Path) -> None:
     except shutil.Error as error:
         raise InputError(f"{error.args[0][0][0]}: cannot be copied; make it readable, and room on the disk.") from None
     for folder in (target, *(path for path in target.rglob("*") if path.is_dir())):
-        folder.chmod(folder.stat().st_mode | stat.S_IRWXU)  # as read-only as those of the source
+        folder.chmod(folder.stat().st_mode | stat.S_IRWXU)  # which is a copy of the source's
     for file in sorted(target.rglob("transforms*.json")):
         _name_own_files(file, source, target)
 

@@ -10,7 +10,7 @@ from splatart_ns.choices import Views
 MOST_PIXELS = 16384
 """Along a side of an image that is made."""
 MOST_STATES = 100_000
-"""Of a dataset."""
+"""Configurations of a bundle that a dataset shows."""
 OBJECTS = ("hinge", "drawer", "arm")
 """The names of the built-in objects."""
 

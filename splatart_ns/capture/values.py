@@ -19,7 +19,7 @@ from splatart_ns.capture.capture import Camera, CaptureError
 from splatart_ns.capture.images import image_size, undistorted_camera
 from splatart_ns.errors import InputError
 from splatart_ns.plain_yaml import parse_yaml
-from splatart_ns.shape import repeated_key
+from splatart_ns.shape import with_keys_once
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -57,13 +57,11 @@ def is_inside(folder: Path, path: Path) -> bool:
 
 
 def read_json(file: Path) -> dict[str, Any]:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if (key := repeated_key(pairs)) is not None:
-            raise CaptureError(file, f"an object has the key {show(key)} twice", "keep one of them")
-        return dict(pairs)
+    def refuse(key: str) -> CaptureError:
+        return CaptureError(file, f"an object has the key {show(key)} twice", "keep one of them")
 
     try:
-        value = json.loads(read_text(file), object_pairs_hook=unique)
+        value = json.loads(read_text(file), object_pairs_hook=with_keys_once(refuse))
     except (ValueError, RecursionError) as error:
         raise CaptureError(file, f"the file is not JSON ({error})", "write it again, or restore a copy") from None
     if not isinstance(value, dict):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -88,12 +88,10 @@ class Export:
         formats = tuple(dict.fromkeys(sum(self.format, ())))
         if not formats:
             raise InputError(f"--format names none; give one or more of {', '.join(get_args(Format))}.")
-        for option, nothing_to in (
-            ("scale", {"html"}),
-            ("density", {"html", "ply"}),
-            ("limit_margin", {"html", "ply"}),
-        ):
-            if getattr(self, option) != type(self).__dataclass_fields__[option].default and set(formats) <= nothing_to:
+        defaults = {field.name: field.default for field in fields(self)}
+        unused = {"scale": {"html"}, "density": {"html", "ply"}, "limit_margin": {"html", "ply"}}
+        for option, nothing_to in unused.items():
+            if getattr(self, option) != defaults[option] and set(formats) <= nothing_to:
                 name = option.replace("_", "-")
                 raise InputError(f"--{name} changes nothing of {' and '.join(formats)}; leave it out.")
         # What cannot be written is said before the meshes are made.

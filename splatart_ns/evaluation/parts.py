@@ -1,4 +1,4 @@
-"""How far the estimated part poses are from the true ones (docs/metrics.md, part poses)."""
+"""How far the estimated part poses are from the true ones (docs/metrics.md, parts)."""
 
 from __future__ import annotations
 

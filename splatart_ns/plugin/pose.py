@@ -487,6 +487,7 @@ class PosePipeline(VanillaPipeline):
 
     @torch.no_grad()
     def _remove_strays(self, optimizers: Optimizers) -> None:
+        """Merged Gaussians that are in free space in some state."""
         model = self.model
         known = model.covariance.isfinite().flatten(2).all(-1)
         stray = strays(model.splat, self._free, model.poses.T(), known)

@@ -139,6 +139,12 @@ def test_one_bundle_is_enough(bundles, make, tmp_path):
     assert json.loads(members(tmp_path / "shard-000000/images.tar")["000000000.json"])["object"] == "a"
 
 
+def test_a_part_that_a_bundle_lacks_is_not_taken_from_the_bundle_before(bundles, make, tmp_path):
+    root = shutil.copytree(bundles, tmp_path / "bundles")
+    next((root / "c/parts").iterdir()).unlink()
+    assert set(make(root, tmp_path / "out", replace(OPTIONS, images=2)).status().values()) == {"failed"}
+
+
 def test_shards_that_fewer_images_would_leave_behind_are_refused(bundles, tmp_path):
     for name in ("shard-000002", "shard-000003-mine", "notes"):
         (tmp_path / name).mkdir()

@@ -399,3 +399,9 @@ def test_the_unit_of_depth_belongs_to_what_a_capture_holds(deep, tmp_path):
     assert capture_digest(load_capture(capture)) == capture_digest(first)
     change_json(capture / "state_01/transforms.json", lambda meta: meta.update(depth_unit_scale_factor=1.0))
     assert capture_digest(load_capture(capture)) != capture_digest(first)
+
+
+def test_names_of_strangers_send_a_terminal_no_orders(run_main, capture_folder):
+    (capture_folder / "state_01").rename(capture_folder / "state_\x1b[31m01")
+    code, output, _ = run_main("check", capture_folder)
+    assert code == 0 and "state_" in output and "\x1b" not in output

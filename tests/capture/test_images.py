@@ -70,6 +70,8 @@ def test_a_film_behind_a_picture_does_not_make_it_cut_off(tmp_path):
     whole = path.read_bytes()
     path.write_bytes(whole + b"\0ftypmp42\xff\xda\0")
     assert abs(read_image(path).astype(int) - 90).max() < 3
+    path.write_bytes(whole[:2] + b"\xff\xff" + whole[2:])  # bytes that may fill the space before a marker
+    assert abs(read_image(path).astype(int) - 90).max() < 3
     # A small picture in the header has an end, too; it is not the picture's.
     thumbnail = b"\xff\xe1" + (2 + len(whole)).to_bytes(2, "big") + whole
     path.write_bytes(whole[:2] + thumbnail + whole[2:])

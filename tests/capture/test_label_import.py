@@ -123,6 +123,19 @@ def test_errors_about_a_copy_name_its_source(capture_folder, tmp_path, edit):
         assert str(error.value).startswith(f"{capture_folder}/{state}/labels/0003.png: its parts have no names")
 
 
+def test_the_copy_of_a_read_only_capture_can_be_written(capture_folder, tmp_path):
+    folders = [path for path in capture_folder.rglob("*") if path.is_dir()]
+    for folder in folders:
+        folder.chmod(0o555)
+    try:
+        import_capture([capture_folder], tmp_path / "new", write_export(capture_folder, tmp_path))
+    finally:
+        for folder in folders:
+            folder.chmod(0o755)
+    copied = [path for path in (tmp_path / "new").rglob("*") if path.is_dir()]
+    assert copied and all(path.stat().st_mode & 0o700 == 0o700 for path in copied)
+
+
 def test_labels_go_into_the_capture_itself_only_on_request(capture_folder, tmp_path):
     truth = all_labels(capture_folder)
     export = write_coco(load_capture(capture_folder), tmp_path / "labels.json", "polygons")
@@ -392,4 +405,4 @@ def test_the_command_says_what_it_did(run_main, capture_folder, tmp_path):
 )
 def test_the_command_needs_a_source_a_target_and_something_to_import(run_main, arguments):
     code, _, errors = run_main("import", *arguments)
-    assert code == 2 and errors.startswith("error: ") and "--output-dir" in errors or "--labels" in errors
+    assert code == 2 and errors.startswith("error: ") and ("--output-dir" in errors or "--labels" in errors)

@@ -16,7 +16,7 @@ from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.plugin.pose import MOST, RATES, THINNING_PARTS
 from splatart_ns.plugin.semantic_run import read_state
 from splatart_ns.stages.initial_motion import InitialMotion
-from splatart_ns.stages.thinning import BUDGET, LARGEST_SHARE, ROUNDS
+from splatart_ns.stages.thinning import BUDGET, LARGEST_SHARE, ROUNDS, absences
 from splatart_ns.stages.world import WorldFit
 
 
@@ -279,6 +279,20 @@ def test_veils_go_first_and_take_nothing_of_the_budget(pose_trainer, monkeypatch
     assert told["veils"] == few and 0 < told["added_error"] <= BUDGET / ROUNDS
     left = {tuple(x) for x in pipeline.model.means.tolist()}
     assert left < {tuple(x) for x in kept.tolist()}
+
+
+def test_states_and_rounds_are_looked_at_with_random_signs_of_their_own(pose_trainer, monkeypatch):
+    seeds = []
+
+    def look(splat, views, seed):
+        seeds.append(seed)
+        return absences(splat, views, seed)
+
+    monkeypatch.setattr("splatart_ns.plugin.pose.absences", look)
+    pipeline = pose_trainer(init="centroids").pipeline
+    for turn in range(ROUNDS):
+        pipeline._absences(turn)
+    assert len(set(seeds)) == len(seeds) == 2 * ROUNDS
 
 
 def test_strays_go_in_every_round_and_in_the_end(pose_trainer, monkeypatch):

@@ -148,7 +148,7 @@ def test_a_value_that_is_not_finite_is_refused_by_name(ply, value):
         (slice(-4, None), 0.0, "rotation of vertex 2 is 0 0 0 0;"),
         (slice(-4, None), 1e-30, "rotation of vertex 2"),
         (slice(-4, None), 1e30, "rotation of vertex 2"),
-        (-5, 100.0, "scale_2 of vertex 2 is 100"),
+        (-5, 31.0, "scale_2 of vertex 2 is 31"),
     ],
 )
 def test_a_gaussian_that_cannot_be_rendered_is_refused(ply, columns, value, found):

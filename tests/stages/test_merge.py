@@ -2,6 +2,7 @@ import torch
 from part_scene import box, motion, photograph
 
 from splatart_ns.splats.splat import Splat
+from splatart_ns.stages import merge
 from splatart_ns.stages.merge import covered, merge_parts
 from splatart_ns.stages.visibility import shown, visibility
 
@@ -69,3 +70,12 @@ def test_gaussians_behind_others_are_not_shown():
     mask = shown(visibility(splat, photograph(splat)))
     assert mask[: len(cube)].float().mean() > 0.9
     assert not mask[len(cube) :].any()
+
+
+def test_the_size_of_a_pixel_does_not_depend_on_which_state_is_first(monkeypatch):
+    splat, told = box(1, (0.8, 0.8, 0.8), (0.0, 0.0, 0.0)), []
+    monkeypatch.setattr(merge, "covered", lambda points, _, footprint: told.append(footprint) or points[:, 0] > 9)
+    views = [photograph(splat, 4, size) for size in (24, 96)]
+    for order in (views, views[::-1]):
+        merge_parts([splat, splat], order, EYE.repeat(2, 1, 1, 1))
+    assert told[0] == told[1] > 0

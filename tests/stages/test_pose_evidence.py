@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from part_scene import angle_deg, motion, nearby, two_states
 
 from splatart_ns.stages import pose_evidence
 from splatart_ns.stages.joint import PRISMATIC_BELOW
-from splatart_ns.stages.part_pair import CHROMA_WEIGHT
+from splatart_ns.stages.part_pair import CHROMA_WEIGHT, part_pair
 from splatart_ns.stages.pose_evidence import refine_poses, rotation_held_ratios
 from splatart_ns.stages.refinement import refine
 
@@ -89,3 +91,12 @@ def test_the_last_refinement_looks_at_hues_and_at_brightness_in_even_light(monke
     truth = motion((0, 0, 20), (0.1, 0.0, 0.0))
     refine_poses(*two_states(truth), poses_of(truth), torch.tensor([[True, True], [True, False]]))
     assert set(looks) == {(CHROMA_WEIGHT, 1.0, True)}
+
+
+def test_a_part_that_nothing_shows_is_not_said_to_have_slid():
+    eye = torch.eye(4, dtype=torch.float64)
+    splats, views = two_states(eye)
+    unseen = tuple(replace(splat, opacity_logits=torch.full_like(splat.opacity_logits, -9.0)) for splat in splats)
+    pair = part_pair(unseen, views, 2, 3, 400)
+    stays = refine(pair, eye)
+    assert not stays.equations.H.any() and pose_evidence._slid_a_little(pair, stays) is None

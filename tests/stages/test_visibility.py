@@ -1,6 +1,9 @@
+import numpy as np
+import pytest
 import torch
 from part_scene import box, photograph
 
+from splatart_ns.capture.view import evenly
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.visibility import HIDDEN, clearest, shown, visibility
 
@@ -17,6 +20,13 @@ def test_what_lies_behind_others_in_all_views_is_hidden_and_what_one_view_shows_
         assert bool((share[-3:] < HIDDEN).all()) == hidden
         assert (share[: len(around)] >= HIDDEN).float().mean() > 0.95
         assert share.min() >= 0 and share.max() < 1.2
+
+
+@pytest.mark.parametrize("count", [0, 1, 40, 41, 100])
+def test_no_more_views_than_wanted_are_looked_at_and_they_lie_all_along(count):
+    chosen = evenly(range(count), 40)
+    assert len(chosen) == min(count, 40)
+    assert np.diff([*chosen, count]).max(initial=0) <= -(-count // 40)
 
 
 def test_of_no_gaussians_nothing_is_shown():

@@ -32,11 +32,6 @@ def export_folder(path: Path, about: dict) -> Iterator[Path]:
         with errors_about(path, fresh):
             yield fresh
         write_json(fresh / MANIFEST, {"format": FORMAT, **about, "files": sorted(_files(fresh))})
-        if path.is_mount():
-            for name in _files(path):
-                (path / name).unlink()
-        elif path.exists():
-            os.replace(path, Path(scratch) / "old")
         put_in_place(fresh, path)
 
 

@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import pytest
 
@@ -91,3 +92,12 @@ def test_an_empty_folder_and_missing_parents_are_filled(tmp_path):
     for path in (tmp_path / "empty", tmp_path / "a" / "b"):
         write(path, "a.txt")
         assert (path / "a.txt").exists()
+
+
+def test_a_mount_gets_the_export_in_place_of_the_one_before(tmp_path, monkeypatch):
+    monkeypatch.setattr(Path, "is_mount", lambda path: path.name == "out")
+    (tmp_path / "out").mkdir()
+    for name in ("first", "second"):
+        write(tmp_path / "out", f"meshes/{name}")
+    left = {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*")}
+    assert left == {"meshes", "meshes/second", MANIFEST}
