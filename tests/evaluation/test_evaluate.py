@@ -3,13 +3,14 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
 from rich.console import Console
 
 from splatart_ns.bundle import save_bundle
 from splatart_ns.capture.digest import capture_identity
-from splatart_ns.capture.formats import load_capture
+from splatart_ns.capture.formats import load_capture, load_novel
 from splatart_ns.errors import InputError
 from splatart_ns.evaluation import evaluate, format_tables
 
@@ -166,3 +167,15 @@ def test_joints_of_parts_without_geometry_are_shown_as_not_comparable_and_not_as
     metrics["joints"][0] |= {"child": "cap", "parent_correct": None, "type_correct": None}
     text = printed(metrics)
     assert "cap (not comparable)" in text and "wrong" not in text
+
+
+def test_images_that_are_not_of_the_test_are_not_scored(folder, capture, tmp_path):
+    copy = Path(shutil.copytree(capture, tmp_path / "capture"))
+    states = [*load_capture(copy).states, *load_novel(copy)]
+    others = [frame.image for state in states for frame in state.frames if frame.split != "test"]
+    assert {file.parts[-3] for file in others} == {"state_00", "state_01", "novel_00"}
+    for file in others:
+        assert cv2.imwrite(str(file), 255 - cv2.imread(str(file), cv2.IMREAD_UNCHANGED))
+    metrics = evaluate(folder, copy)
+    assert min(scores["psnr"] for scores in metrics["images"].values()) > 40
+    assert metrics["held_out"]["novel_00"]["psnr"] > 40

@@ -338,3 +338,23 @@ def test_a_checkpoint_is_looked_at(capture_dir, semantic_trainer):
     looked_at = trainer.config.pipeline.setup(device="cpu", test_mode="test")
     looked_at.load_pipeline(torch.load(file)["pipeline"], 3)
     assert torch.equal(looked_at.model.means, trainer.pipeline.model.means)
+
+
+def test_masked_pixels_count_in_no_loss_of_colour_and_silhouette(capture_dir, semantic_trainer, tmp_path):
+    capture = shutil.copytree(capture_dir, tmp_path / "capture")
+    file = capture / "state_00/transforms.json"
+    meta = json.loads(file.read_text())
+    for frame in meta["frames"]:
+        frame["mask_path"] = "mask.png"
+    file.write_text(json.dumps(meta))
+    mask = np.repeat([[255, 0]], 32, axis=1).repeat(64, axis=0).astype(np.uint8)
+    assert cv2.imwrite(str(capture / "state_00/mask.png"), mask)
+    trainer = semantic_trainer(capture)
+    model = trainer.pipeline.model
+    model.step_cb(trainer.optimizers, 0)
+    camera, batch = trainer.pipeline.datamanager.next_train(0)
+    assert not batch["mask"].all() and batch["mask"].any()
+    outputs = model(camera)
+    spoiled = batch | {"image": torch.where(batch["mask"], batch["image"], 1.0)}
+    losses, spoiled = (model.get_loss_dict(outputs, data) for data in (batch, spoiled))
+    assert {name: float(x) for name, x in losses.items()} == pytest.approx({n: float(x) for n, x in spoiled.items()})
