@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -63,10 +64,7 @@ def _classes(file: Path, meta: dict[str, Any]) -> list[str] | None:
 def safe_names(names: Sequence[str]) -> list[str]:
     """Names that can be file names everywhere: of [A-Za-z0-9_.-], and unique even where case does not count. Those that
     can be keep theirs, so that no name becomes what another one is."""
-    bases = [
-        re.sub(r"[^A-Za-z0-9_.-]+", "_", name)[:64].lstrip(".-").rstrip(".") or f"part_{i + 1}"
-        for i, name in enumerate(names)
-    ]
+    bases = [_safe(name) or f"part_{i + 1}" for i, name in enumerate(names)]
     out: dict[int, str] = {}
     taken: set[str] = set()
     for i in sorted(range(len(names)), key=lambda i: bases[i] != names[i]):
@@ -77,6 +75,14 @@ def safe_names(names: Sequence[str]) -> list[str]:
         taken.add(safe.lower())
         out[i] = safe
     return [out[i] for i in range(len(names))]
+
+
+def _safe(name: str) -> str:
+    """Without accents, and `_` for what else is not allowed between letters; may be empty."""
+    if re.fullmatch(r"[A-Za-z0-9_.-]*", name) is None:
+        plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+        name = re.sub(r"[^A-Za-z0-9_.-]+", "_", plain).strip("_")
+    return name[:64].lstrip(".-").rstrip(".")
 
 
 def _largest_label(frames: Sequence[Frame], report: Report) -> int:

@@ -251,6 +251,7 @@ def test_part_names_become_safe_and_unique_file_names():
     assert max(map(len, made)) <= 64
     assert safe_names(["link_0", "panda.finger-1"]) == ["link_0", "panda.finger-1"]
     assert safe_names(["a b", "A_b", "a_b_2"]) == ["a_b_3", "A_b", "a_b_2"]
+    assert safe_names(["Tür links", "蓋", "ドア 左", "_a"]) == ["Tur_links", "part_2", "part_3", "_a"]
 
 
 @pytest.mark.parametrize(
