@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from splatart_ns.bundle import JOINT_DOFS
-from splatart_ns.bundle.export import PartShape, describe, export, validate
+from splatart_ns.bundle.export import PartShape, describe, export, validate, validation
 from splatart_ns.bundle.export.names import identifier
 from splatart_ns.bundle.export.simulation import simulate
 
@@ -129,6 +129,22 @@ def test_a_loop_forbids_what_its_joint_forbids(objects, tmp_path, kind):
         assert abs(turn) < 0.05 and slide == pytest.approx(0.1, abs=0.01)
 
 
+def test_a_screw_that_closes_a_loop_lets_what_turns_slide_along(objects, tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    bundle = objects.chain(["cylindrical"])
+    bundle.joints.append(objects.joint("again", "screw", "p0", "p1", 1, in_tree=False, pitch=0.1))
+    path = export(bundle, objects.robot(bundle), "mjcf", tmp_path / "out")
+    model = mujoco.MjModel.from_xml_path(str(path))
+    slides = model.actuator("j1_slide").id
+    model.actuator_gainprm[slides] = model.actuator_biasprm[slides] = 0.0  # goes where it is pushed
+    model.opt.gravity[:] = 0
+    data = mujoco.MjData(model)
+    data.ctrl[model.actuator("j1_turn").id] = 0.9
+    mujoco.mj_step(model, data, 1000)
+    slide, turn = (float(data.joint(f"j1_{name}").qpos[0]) for name in ("slide", "turn"))
+    assert turn == pytest.approx(0.9, abs=0.05) and slide == pytest.approx(0.1 * turn, abs=0.005)
+
+
 def test_a_loop_that_closes_is_simulated(objects, tmp_path):
     """Two links side by side with the same hinge, and welded to each other: they turn together."""
     mujoco = pytest.importorskip("mujoco")
@@ -200,10 +216,10 @@ def test_an_object_too_small_for_mujocos_urdf_reader_is_said_to_be(objects, tmp_
     assert_good(validate(export(bundle, robot, "mjcf", tmp_path / "mjcf"), "mjcf", bundle, robot))
 
 
-@pytest.mark.parametrize("turns", [3, 1000])
+@pytest.mark.parametrize("turns", [3, 1000, -30])
 def test_an_animation_goes_the_long_way_of_many_turns(objects, tmp_path, turns):
     bundle = objects.chain(["screw", "revolute"])
-    bundle.joints[0].limits = (0.0, turns * 2 * np.pi)
+    bundle.joints[0].limits = tuple(sorted((0.0, turns * 2 * np.pi)))
     robot = objects.robot(bundle)
     path = export(bundle, robot, "glb", tmp_path / "out")
     assert_good(validate(path, "glb", bundle, robot))
@@ -235,8 +251,6 @@ def test_a_damaged_file_fails_without_a_traceback(objects, tmp_path, form):
 
 
 def test_a_warning_of_a_program_fails(objects, tmp_path, monkeypatch):
-    from splatart_ns.bundle.export import validation as module
-
     class Loud:
         def __init__(self, path, robot):
             logging.getLogger("loud").warning("no mesh for you")
@@ -247,9 +261,18 @@ def test_a_warning_of_a_program_fails(objects, tmp_path, monkeypatch):
 
     bundle = objects.chain(["fixed"])
     robot = objects.robot(bundle)
-    monkeypatch.setitem(module._CONSUMERS, "urdf", (("loud", Loud),))
+    monkeypatch.setitem(validation._CONSUMERS, "urdf", (("loud", Loud),))
     checks = validate(tmp_path / "x.urdf", "urdf", bundle, robot)
     assert {c.found for c in checks if c.verdict == "failed"} >= {"no mesh for you", "nor here"}
+
+
+def test_poses_that_are_no_numbers_fail(objects, tmp_path, monkeypatch):
+    bundle = objects.chain(["fixed"])
+    robot = objects.robot(bundle)
+    lost = Mock(poses=Mock(return_value={"p0": np.eye(4), "p1": np.full((4, 4), np.nan)}))
+    monkeypatch.setitem(validation._CONSUMERS, "urdf", (("lost", lambda path, robot: lost),))
+    found = report(validate(tmp_path / "x.urdf", "urdf", bundle, robot))
+    assert found["lost", "link poses"][0] == "failed"
 
 
 def test_a_program_that_is_not_installed_is_said_to_be(objects, tmp_path, monkeypatch):
@@ -288,6 +311,27 @@ def test_pose_errors_are_relative_to_the_object(objects, tmp_path):
     moved.links["p1"] = dataclasses.replace(link, origin=link.origin + 1e-7)
     found = report(validate(path, "glb", bundle, moved))
     assert found["trimesh", "link poses"][0] == "failed"
+
+
+def test_links_that_touch_at_rest_fail(objects, tmp_path):
+    """Neighbours may, and what is known to overlap; here that is not known."""
+    pytest.importorskip("mujoco")
+    bundle = objects.chain(["fixed", "revolute"])
+    robot = dataclasses.replace(describe(bundle, objects.shapes(bundle, size=1.6), "thing"), overlaps={})
+    found = report(validate(export(bundle, robot, "mjcf", tmp_path / "out"), "mjcf", bundle, robot))
+    assert found["mujoco", "contacts at rest"] == ("failed", "'p0' and 'p2'")
+
+
+@pytest.mark.parametrize(("up", "sinks"), [("0 0 1", True), ("0 0 -1", True), ("1 0 0", False)])
+def test_a_joint_that_sinks_beyond_either_limit_is_told(tmp_path, up, sinks):
+    pytest.importorskip("mujoco")
+    (tmp_path / "robot.xml").write_text(
+        f"""<mujoco><worldbody><body>
+        <joint name="j" type="slide" axis="{up}" range="-0.1 0.1" limited="true" solreflimit="0.5 1"/>
+        <geom size="0.1" mass="50"/>
+        </body></worldbody><actuator><position joint="j" kp="1" ctrlrange="-0.1 0.1"/></actuator></mujoco>"""
+    )
+    assert (simulate(tmp_path / "robot.xml").excess > 0.05) == sinks
 
 
 def test_a_simulation_that_explodes_is_told_and_leaves_no_log_where_one_stands(tmp_path, monkeypatch):

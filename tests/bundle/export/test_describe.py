@@ -36,6 +36,14 @@ def test_lengths_are_in_metres(objects, unit, given, scale, noted):
     assert robot.links["p0"].surface.volume == pytest.approx(scale**3 * 0.3 * 0.24 * 0.18)
 
 
+def test_a_loop_is_in_metres(objects):
+    bundle = objects.chain(["screw"])
+    bundle.joints.append(objects.joint("again", "screw", "p0", "p1", 1, in_tree=False))
+    (loop,) = objects.robot(bundle, scale=0.5).loops
+    np.testing.assert_allclose(loop.origin, 0.5 * bundle.joints[1].origin.numpy())
+    assert loop.pitch == pytest.approx(0.5 * 0.03)
+
+
 @pytest.mark.parametrize(("scale", "noted"), [(1e-3, True), (0.1, False), (10.0, False), (1000.0, True)])
 def test_a_size_that_must_be_a_mistake_is_noted(objects, scale, noted):
     robot = objects.robot(objects.chain(["revolute"]), scale=scale)

@@ -35,6 +35,12 @@ def glb_tree(path):
     return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
 
 
+def opened_usd(path):
+    from pxr import Usd
+
+    return Usd.Stage.Open(str(path))
+
+
 def test_a_urdf_has_all_that_simulators_ask_for(write):
     root = ElementTree.parse(write("urdf")).getroot()
     for link in root.findall("link"):
@@ -56,8 +62,9 @@ def test_a_urdf_has_all_that_simulators_ask_for(write):
     assert mimic.get("joint") == "j2_turn" and float(mimic.get("multiplier")) == pytest.approx(0.03)
 
 
-def test_masses_are_where_they_are_and_fall_down(objects, tmp_path):
-    mujoco = pytest.importorskip("mujoco")
+@pytest.fixture
+def weighty(objects):
+    """A bundle and its robot, whose masses lie beside the origins and are turned."""
     bundle = objects.chain(["revolute", "prismatic"])
     robot, R = objects.robot(bundle), Rotation.from_rotvec([0.4, -0.7, 0.9]).as_matrix()
     links = {
@@ -67,7 +74,12 @@ def test_masses_are_where_they_are_and_fall_down(objects, tmp_path):
         )
         for name, link in robot.links.items()
     }
-    robot = replace(robot, links=links)
+    return bundle, replace(robot, links=links)
+
+
+def test_masses_are_where_they_are_and_fall_down(weighty, tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    bundle, robot = weighty
     urdf, mjcf = (export(bundle, robot, form, tmp_path / form) for form in ("urdf", "mjcf"))
     model = mujoco.MjModel.from_xml_path(str(mjcf))
     assert model.opt.gravity.tolist() == [0, 0, -GRAVITY]
@@ -83,6 +95,37 @@ def test_masses_are_where_they_are_and_fall_down(objects, tmp_path):
         told = {key: float(value) for key, value in own.find("inertia").items()}
         of_file = [told[f"i{a}{b}"] for a, b in ("xx", "xy", "xz", "yy", "yz", "zz")]
         np.testing.assert_allclose(of_file, inertia.tensor[np.triu_indices(3)], rtol=1e-6, atol=1e-12)
+
+
+def test_masses_of_a_usd_are_where_they_are_and_fall_down(weighty, tmp_path):
+    pxr = pytest.importorskip("pxr.UsdPhysics")
+    stage, robot = opened_usd(export(*weighty, "usd", tmp_path / "out")), weighty[1]
+    assert pxr.Scene(stage.GetPrimAtPath("/thing/scene")).GetGravityDirectionAttr().Get() == (0, 0, -1)
+    for name, link in robot.links.items():
+        told = pxr.MassAPI(stage.GetPrimAtPath(f"/thing/{name}"))
+        assert told.GetMassAttr().Get() == pytest.approx(link.inertia.mass)
+        np.testing.assert_allclose(told.GetCenterOfMassAttr().Get(), link.inertia.centre, atol=1e-8)
+        q = told.GetPrincipalAxesAttr().Get()
+        R = Rotation.from_quat([q.GetReal(), *q.GetImaginary()], scalar_first=True).as_matrix()
+        tensor = R @ np.diag(told.GetDiagonalInertiaAttr().Get()) @ R.T
+        np.testing.assert_allclose(tensor, link.inertia.tensor, rtol=1e-5, atol=1e-6)
+
+
+def test_small_links_between_freedoms_add_little_to_the_mass(objects, tmp_path):
+    bundle = objects.chain(["free", "screw"])
+    robot = objects.robot(bundle)
+    root = ElementTree.parse(export(bundle, robot, "urdf", tmp_path / "out")).getroot()
+    masses = [float(mass.get("value")) for mass in root.iter("mass")]
+    assert len(masses) == 3 + 5 + 1 and min(masses) > 0
+    assert sum(masses) < 1.05 * sum(link.inertia.mass for link in robot.links.values())
+
+
+def test_links_have_the_mean_colour_of_their_surface(write):
+    urdf, mjcf = (ElementTree.parse(write(form)).getroot() for form in ("urdf", "mjcf"))
+    told = [urdf.find("link[@name='p1']/visual/material/color"), mjcf.find(".//body[@name='p1']/geom[@class='visual']")]
+    for element in told:
+        colour = np.array(element.get("rgba").split(), float)
+        np.testing.assert_allclose(colour, [200 / 255, 20 / 255, 40 / 255, 1], atol=1e-3)
 
 
 def test_mesh_files_are_beside_the_description_and_in_the_links_frame(objects, write):
@@ -117,9 +160,9 @@ def test_an_mjcf_keeps_neighbours_from_colliding_and_drives_what_has_a_value_of_
 
 def test_a_usd_is_an_articulation_fixed_to_the_world(write):
     pxr = pytest.importorskip("pxr.UsdPhysics")
-    from pxr import Usd, UsdGeom
+    from pxr import UsdGeom
 
-    stage = Usd.Stage.Open(str(write("usd")))
+    stage = opened_usd(write("usd"))
     assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
     root = stage.GetPrimAtPath("/thing/joints/world")
     assert root.HasAPI(pxr.ArticulationRootAPI) and root.IsA(pxr.FixedJoint)
@@ -128,6 +171,41 @@ def test_a_usd_is_an_articulation_fixed_to_the_world(write):
     assert hinge.GetUpperLimitAttr().Get() == pytest.approx(np.degrees(1.26))
     piece = stage.GetPrimAtPath("/thing/p1/collision_0")
     assert piece.HasAPI(pxr.CollisionAPI) and pxr.MeshCollisionAPI(piece).GetApproximationAttr().Get() == "convexHull"
+
+
+def test_a_usd_has_turns_in_degrees_and_motors_that_carry_the_load(objects, tmp_path):
+    pxr = pytest.importorskip("pxr.UsdPhysics")
+    bundle = objects.chain(["revolute", "prismatic"])
+    robot = objects.robot(bundle, density=1000.0)
+    stage = opened_usd(export(bundle, robot, "usd", tmp_path / "out"))
+    turn, slide = (stage.GetPrimAtPath(f"/thing/joints/{name}") for name in ("j1", "j2"))
+    ends = [[joint.GetAttribute(f"physics:{end}Limit").Get() for end in ("lower", "upper")] for joint in (turn, slide)]
+    np.testing.assert_allclose(ends, [np.degrees([-0.06, 1.26]), [-0.32, 0.12]], rtol=1e-6)
+    turning, sliding = pxr.DriveAPI(turn, "angular"), pxr.DriveAPI(slide, "linear")
+    assert turning.GetDampingAttr().Get() * np.degrees(1) == pytest.approx(DAMPING)  # a torque per degree a second
+    assert sliding.GetDampingAttr().Get() == pytest.approx(DAMPING)
+    weight = robot.links["p2"].inertia.mass * GRAVITY
+    assert sliding.GetMaxForceAttr().Get() == pytest.approx(3 * weight) and 3 * weight > EFFORT
+    assert turning.GetMaxForceAttr().Get() > 0.7 * 3 * weight  # about as many newtons, more than that far away
+
+
+def test_a_usd_keeps_neighbours_from_colliding_and_locks_what_a_loop_forbids(objects, tmp_path):
+    pxr = pytest.importorskip("pxr.UsdPhysics")
+    bundle = objects.chain(["revolute", "prismatic"])
+    bundle.joints.append(objects.joint("round", "cylindrical", "p2", "p0", 1, in_tree=False))
+    stage = opened_usd(export(bundle, objects.robot(bundle), "usd", tmp_path / "out"))
+    apart = set()
+    for name in ("p0", "p1", "p2"):
+        filtered = pxr.FilteredPairsAPI(stage.GetPrimAtPath(f"/thing/{name}")).GetFilteredPairsRel()
+        apart |= {frozenset((name, path.name)) for path in filtered.GetTargets()}
+    assert apart == {frozenset(pair) for pair in (("p0", "p1"), ("p1", "p2"), ("p0", "p2"))}
+    loop = stage.GetPrimAtPath("/thing/joints/round")
+    assert {name for name in loop.GetAppliedSchemas() if name.startswith("PhysicsLimitAPI")} == {
+        f"PhysicsLimitAPI:{direction}" for direction in ("transY", "transZ", "rotY", "rotZ")
+    }
+    for direction in ("transY", "transZ", "rotY", "rotZ"):
+        limit = pxr.LimitAPI(loop, direction)
+        assert limit.GetLowAttr().Get() > limit.GetHighAttr().Get()  # as UsdPhysics has what cannot move
 
 
 def test_a_usd_that_finds_no_room_is_named(write, tmp_path, small_files):
@@ -161,6 +239,14 @@ def test_colours_in_a_glb_are_of_light(write):
     start = 28 + int.from_bytes(data[12:16], "little") + view["byteOffset"]
     colour = np.frombuffer(data, "u1", 3, start) / 255
     np.testing.assert_allclose(colour, linear_from_srgb(np.array([200, 20, 40]) / 255), atol=0.5 / 255)
+
+
+def test_colours_in_a_usd_are_of_light(write):
+    pytest.importorskip("pxr.UsdPhysics")
+    stage = opened_usd(write("usd"))
+    shown = stage.GetPrimAtPath("/thing/p1/visual").GetAttribute("primvars:displayColor").Get()
+    assert len(shown) == 8
+    np.testing.assert_allclose(shown, [linear_from_srgb(np.array([200, 20, 40]) / 255)] * 8, atol=1e-6)
 
 
 def test_srgb_at_its_known_points():
@@ -232,7 +318,7 @@ def corners_of(path, form):
     UsdGeom = pytest.importorskip("pxr.UsdGeom")
     from pxr import Usd
 
-    stage = Usd.Stage.Open(str(path))
+    stage = opened_usd(path)
     box = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["default"]).ComputeWorldBound(stage.GetDefaultPrim())
     aligned = box.ComputeAlignedRange()
     return np.array([aligned.GetMin(), aligned.GetMax()])
