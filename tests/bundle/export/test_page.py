@@ -1,18 +1,25 @@
 """The page of `--format html`, without a browser."""
 
+import json
 import math
 import re
+import shutil
+import subprocess
 from dataclasses import replace
+from importlib import resources
 
 import numpy as np
 import pytest
 import torch
 
+from splatart_ns.bundle import configured_motions
 from splatart_ns.bundle.export import export, page, validate
 from splatart_ns.bundle.export.page_model import PageModel
 from splatart_ns.bundle.export.quantization import quantized, restored
+from splatart_ns.bundle.sliders import bundle_sliders, configuration
 from splatart_ns.rasterize.render import PIXEL_VARIANCE
 
+NODE = shutil.which("node")
 KINDS = ("revolute", "prismatic", "screw", "cylindrical", "spherical", "free", "fixed")
 EVIL = '</script><img src=x onerror="alert(1)"><!--<script>{{scripts}}'
 
@@ -39,15 +46,71 @@ def test_a_page_is_one_file_that_loads_nothing(objects, write):
     assert "://" not in text and "fetch(" not in text and "import(" not in text
 
 
-def test_its_data_are_the_bundles_and_checked(objects, write):
+def test_its_gaussians_are_the_bundles_to_half_a_step(objects, write):
+    bundle = objects.chain(["revolute", "prismatic"])
+    g = torch.Generator().manual_seed(0)
+    for part, coefficients in zip(bundle.parts, (1, 4, 16), strict=True):
+        splat = part.splat
+        splat.log_scales += torch.randn(6, 3, generator=g)
+        splat.opacity_logits += torch.randn(6, generator=g)
+        part.splat = replace(splat, sh=torch.randn(6, coefficients, 3, generator=g))
+    bundle.parts[1].splat.quats[2] *= 1000  # the same turn
+    model = PageModel(write(bundle)[0])
+    for i, part in enumerate(bundle.parts):
+        splat = part.splat
+        wanted = {
+            "means": (splat.means, 16),
+            "quats": (torch.nn.functional.normalize(splat.quats), 16),
+            "log_scales": (splat.log_scales, 8),
+            "opacities": (splat.opacity_logits.sigmoid()[:, None], 8),
+            "sh": (torch.cat(splat.sh.unbind(1), 1), 8),
+        }
+        assert set(model.object["parts"][i]["columns"]) == set(wanted)
+        for name, (values, bits) in wanted.items():
+            half_steps = np.ptp(values.numpy(), axis=0) / (2**bits - 1) / 2
+            assert (np.abs(model.column(i, name) - values.numpy()) <= half_steps + 1e-6).all(), name
+
+
+def test_its_joints_are_the_bundles(objects, write):
     bundle = objects.chain(list(KINDS))
-    path, robot = write(bundle)
-    checks = validate(path, "html", bundle, robot)
-    assert verdicts(checks) == {"Gaussians": "passed", "part poses": "passed"}
-    other = objects.chain(list(KINDS))
-    other.joints[0].origin += 1e-3
-    other.parts[2] = replace(other.parts[2], splat=other.parts[2].splat.select(torch.arange(5)))
-    assert verdicts(validate(path, "html", other, robot)) == {"Gaussians": "failed", "part poses": "failed"}
+    told = PageModel(write(bundle)[0]).object
+    assert [part["name"] for part in told["parts"]] == bundle.part_names
+    for i, (own, joint) in enumerate(zip(told["joints"], bundle.joints, strict=True)):
+        assert (own["name"], own["type"], own["parent"], own["child"]) == (joint.name, joint.type, i, i + 1)
+        assert (own["axis"], own["origin"]) == (joint.axis.tolist(), joint.origin.tolist())
+        assert np.array_equal(np.squeeze(own["values"]), joint.values) and own["pitch"] == joint.pitch
+        assert own["limits"] == (None if joint.limits is None else list(joint.limits))
+
+
+@pytest.mark.skipif(NODE is None, reason="node is not installed")
+def test_its_script_moves_parts_as_the_bundle_does(objects):
+    bundle = objects.chain(list(KINDS))
+    sliders, about = bundle_sliders(bundle), page.page_object(bundle)
+    q = configuration(sliders, np.random.default_rng(0).uniform(-30, 30, len(sliders)))
+    values = [np.ravel(q.get(joint["name"], 0.0)).tolist() for joint in about["joints"]]
+    motion = (resources.files("splatart_ns.bundle.export") / "web/motion.js").read_text(encoding="utf-8")
+    script = f"{motion}\nconsole.log(JSON.stringify(partMotions({json.dumps(about)}, {json.dumps(values)})))"
+    told = json.loads(subprocess.run([NODE], input=script, capture_output=True, text=True, check=True).stdout)
+    wanted = [T.numpy() for T in configured_motions(bundle, q).values()]
+    np.testing.assert_allclose(np.reshape(told, (-1, 4, 4)), wanted, atol=1e-9)
+
+
+def test_its_data_are_checked(objects, write):
+    path, robot = write(objects.chain(list(KINDS)))
+
+    def found(change=lambda bundle: None):
+        bundle = objects.chain(list(KINDS))
+        change(bundle)
+        checked = verdicts(validate(path, "html", bundle, robot))
+        return checked["Gaussians"], checked["part poses"]
+
+    def lose(bundle):
+        bundle.parts[2].splat = bundle.parts[2].splat.select(torch.arange(5))
+
+    assert found() == ("passed", "passed")
+    assert found(lambda bundle: bundle.parts[1].splat.means[3].add_(0.01)) == ("failed", "passed")
+    assert found(lose) == ("failed", "passed")
+    assert found(lambda bundle: bundle.joints[0].origin.add_(1e-3)) == ("passed", "failed")
 
 
 def test_no_name_gets_out_of_the_data(objects, write):
@@ -107,12 +170,17 @@ def test_loops_are_listed_after_the_tree_and_empty_parts_are_written(objects, wr
     assert set(verdicts(validate(path, "html", bundle, robot)).values()) == {"passed"}
 
 
-def test_needles_and_points_keep_their_size_where_it_can_be_seen(objects):
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_needles_and_points_keep_their_size_where_it_can_be_seen(objects, unit):
     bundle = objects.chain(["revolute"])
     bundle.parts[0].splat.log_scales[0] = torch.tensor([-1.0, -4.0, -40.0])
+    for part in bundle.parts:
+        part.splat.means *= unit
+        part.splat.log_scales += math.log(unit)
+    bundle.joints[0].origin *= unit
     column = page.page_object(bundle)["parts"][0]["columns"]["log_scales"]
-    sizes = np.exp(restored(column)[0])
-    assert sizes[:2] == pytest.approx([math.exp(-1), math.exp(-4)], rel=0.02) and sizes[2] < 1e-3
+    sizes = np.exp(restored(column)[0]) / unit
+    assert sizes[:2] == pytest.approx([math.exp(-1), math.exp(-4)], rel=0.02) and 1e-5 < sizes[2] < 1e-3
 
 
 def test_the_page_blurs_gaussians_as_the_rasterizer_does(objects, write):
