@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 import torch
 from rich.console import Console
@@ -137,6 +138,34 @@ def test_a_bundle_of_another_capture_is_refused(bundle, folder, capture):
     save_bundle(bundle, folder)
     with pytest.raises(InputError, match="1 states"):
         evaluate(folder, capture)
+
+
+def test_the_truth_of_other_states_is_refused(folder, capture, tmp_path):
+    copy = Path(shutil.copytree(capture, tmp_path / "capture"))
+    truth = json.loads((copy / "ground_truth.json").read_text())
+    for record in (truth, *truth["joints"]):
+        states = record["states" if record is truth else "values"]
+        states.append(states[1])
+    (copy / "ground_truth.json").write_text(json.dumps(truth))
+    with pytest.raises(InputError, match="has 3 states but the capture has 2; give the truth of the same states"):
+        evaluate(folder, copy)
+
+
+def test_states_with_worlds_of_their_own_are_scored_in_the_bundles(bundle, folder, capture, tmp_path):
+    copy = Path(shutil.copytree(capture, tmp_path / "capture"))
+    (copy / "ground_truth.json").unlink()
+    shutil.rmtree(copy / "eval")
+    world = np.array([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
+    file = copy / "state_01/transforms.json"
+    meta = json.loads(file.read_text())
+    for frame in meta["frames"]:
+        T = world @ np.array(frame["transform_matrix"])
+        T[:3, :3] /= 2
+        frame["transform_matrix"] = T.tolist()
+    file.write_text(json.dumps(meta))
+    bundle.provenance["worlds"] = [np.eye(4).tolist(), np.linalg.inv(world).tolist()]
+    save_bundle(bundle, folder)
+    assert min(scores["psnr"] for scores in evaluate(folder, copy)["images"].values()) > 45
 
 
 def test_the_tables_show_every_joint_and_configuration(folder, capture):

@@ -4,6 +4,7 @@ import torch
 
 from splatart_ns.evaluation import geometry
 from splatart_ns.evaluation.geometry import chamfer, chamfer_centres, chamfer_mesh, farthest_points
+from splatart_ns.geometry.se3 import so3_exp
 
 
 def test_chamfer_sums_mean_squared_distances_of_both_directions():
@@ -55,6 +56,17 @@ def test_a_wrong_motion_shows_at_the_last_state_alone(truth, bundle):
     assert values["CD-m"] == pytest.approx(0, abs=1e-9)
     assert values["last"]["parts"]["latch"] > 1
     assert values["last"]["parts"]["door"] == pytest.approx(0, abs=1e-9)
+
+
+def test_the_last_state_is_seen_from_the_true_root(truth, bundle):
+    """In whatever world the estimate has it, and whatever it takes for its root."""
+    G = torch.eye(4, dtype=torch.float64)
+    G[:3, :3], G[:3, 3] = so3_exp(torch.tensor([0.3, 1.0, -2.0])), torch.tensor([5.0, 6, 7])
+    for part in bundle.parts:
+        part.motion[1] = G @ part.motion[1]
+    bundle.root = "door"
+    last = chamfer_centres(truth, bundle)["last"]
+    assert [last[key] for key in ("CD-s", "CD-m", "CD-w")] == pytest.approx([0, 0, 0], abs=1e-6)
 
 
 def test_a_missing_part_is_null(truth, bundle):

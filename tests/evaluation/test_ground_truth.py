@@ -36,6 +36,11 @@ def test_the_file_gives_the_truth(capture, truth):
         torch.testing.assert_close(read.points[part], truth.points[part])
 
 
+def test_a_continuous_joint_is_a_hinge(copied):
+    rewrite(copied, lambda value: value["joints"][0].update(type="continuous"))
+    assert [joint.type for joint in load_ground_truth(copied).joints] == ["revolute", "prismatic"]
+
+
 def test_a_capture_may_have_none(tmp_path):
     assert load_ground_truth(tmp_path) is None
 

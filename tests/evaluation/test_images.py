@@ -41,6 +41,21 @@ def test_views_without_silhouettes_and_labels_that_do_not_show_the_object_score_
     assert len(notes) == 2
 
 
+def test_images_are_compared_on_white(bundle, tmp_path):
+    """Where nothing is rendered, what is white in the image is right and what is grey is not."""
+    away = torch.eye(4)
+    away[2, 3] = -100
+    full = torch.full((4, 4), 255, dtype=torch.uint8)
+
+    def score(value):
+        rgb = torch.full((4, 4, 3), value, dtype=torch.uint8)
+        view = View("v", away, torch.eye(3), 4, 4, rgb, alpha=full)
+        return image_scores(bundle, observed_motions(bundle, 0), [view], Capture(tmp_path, (), {}))[0]["psnr"]
+
+    assert score(255) == math.inf
+    assert score(204) == pytest.approx(-20 * math.log10(0.2), abs=1e-3)
+
+
 @pytest.fixture
 def opaque_views(capture):
     """The test views of state 0 in front of grey, labelled and without an alpha."""
