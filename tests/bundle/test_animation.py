@@ -48,14 +48,19 @@ def test_parts_have_their_colours(bundle, view):
     assert (distances < 0.06).all()
 
 
-def test_accumulation_is_grey_and_depth_tells_near_from_far(bundle, view):
+def test_accumulation_is_grey_and_what_is_near_is_red_and_what_is_far_blue(bundle):
     for part in bundle.parts:
         part.splat.log_scales += 0.7
-    (accumulation,) = render_frames(ArticulatedSplat(bundle), [{}], view, "accumulation")
+    view = orbit_camera(*bounding_sphere(bundle, [{}]), 0.0, 0.2, 48, 40)
+    splat = ArticulatedSplat(bundle)
+    (accumulation,) = render_frames(splat, [{}], view, "accumulation")
     assert (accumulation[..., 0] == accumulation[..., 2]).all() and accumulation.max() > 200
-    (depth,) = render_frames(ArticulatedSplat(bundle), [{}], view, "depth", background=(0.0, 0.0, 0.0))
+    (shown,) = render_frames(splat, [{}], view, "depth", background=(0.0, 0.0, 0.0))
     covered = accumulation[..., 0] > 200
-    assert len(np.unique(depth[covered], axis=0)) > 5
+    colours, depths = shown[covered].astype(int), splat.render(view, {}, depth=True).depth.numpy()[covered]
+    near, far = colours[depths.argsort()][[0, -1]]
+    assert near[0] > near[2] and far[2] > far[0]
+    assert len(np.unique(colours, axis=0)) > 5
 
 
 @pytest.mark.parametrize("output", ["rgb", "depth", "accumulation", "parts"])

@@ -1,5 +1,6 @@
 """The configuration of a known object in images of it."""
 
+import copy
 import math
 from dataclasses import replace
 
@@ -61,13 +62,28 @@ def views_of(bundle, q):
     return photograph(normalized(posed_splat(bundle, q), NORMALIZATION))
 
 
-@pytest.mark.parametrize(("door", "knob"), [(0.4, 0.8), (-1.3, 0.9), (2.9, 2.1)])
-def test_values_are_found_inside_and_beyond_the_observed_range(cabinet, door, knob):
+def in_unit(bundle: Bundle, unit: float) -> Bundle:
+    """The same object, all of its lengths multiplied by `unit`."""
+    bundle = copy.deepcopy(bundle)
+    for part in bundle.parts:
+        part.splat.means *= unit
+        part.splat.log_scales += math.log(unit)
+    for own in bundle.joints:
+        own.origin *= unit
+        if own.type == "prismatic":
+            own.values *= unit
+            own.limits = tuple(unit * end for end in own.limits)
+    return bundle
+
+
+@pytest.mark.parametrize(("door", "knob", "unit"), [(0.4, 0.8, 1.0), (-1.3, 0.9, 1e-3), (2.9, 2.1, 1e3)])
+def test_values_are_found_inside_and_beyond_the_observed_range(cabinet, door, knob, unit):
     q = {"base_door": door, "door_knob": knob, "base_ball": [0.15, 0.3, -0.1]}
-    found = fit_configuration(cabinet, views_of(cabinet, q), NORMALIZATION)
+    normalization = Normalization(unit * NORMALIZATION.centre, NORMALIZATION.scale / unit)
+    found = fit_configuration(in_unit(cabinet, unit), views_of(cabinet, q), normalization)
     assert found.converged and found.unseen == []
     assert float(found.q["base_door"]) == pytest.approx(door, abs=6e-3)
-    assert float(found.q["door_knob"]) == pytest.approx(knob, abs=0.04)  # 0.004 of the object's size
+    assert float(found.q["door_knob"]) / unit == pytest.approx(knob, abs=0.04)  # 0.004 of the object's size
     torch.testing.assert_close(found.q["base_ball"], torch.tensor(q["base_ball"], dtype=D), atol=0.02, rtol=0)
 
 
