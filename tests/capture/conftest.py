@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_capture import FRAMES, SIZE, STATES, entry, intrinsics, pose, write_images, write_state
+from small_capture import FRAMES, STATES, entry, intrinsics, pose, write_images, write_state
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def single_file_folder(tmp_path: Path) -> Path:
 def paris_folder(tmp_path: Path) -> Path:
     """A sound capture in the layout of PARIS."""
     path = tmp_path / "paris"
-    K = [[20.0, 0.0, SIZE / 2], [0.0, 20.0, SIZE / 2], [0.0, 0.0, 1.0]]
+    K = [[20.0, 0.0, 7.0], [0.0, 22.0, 9.0], [0.0, 0.0, 1.0]]
     for state in ("start", "end"):
         for split, numbers in (("train", range(5)), ("val", range(5, 6)), ("test", range(6, 8))):
             for i in numbers:

@@ -81,7 +81,8 @@ def test_paris_layout(paris_folder):
     assert names(start.split("val")) == ["val/0005.png"]
     assert names(start.split("test")) == ["test/0006.png", "test/0007.png"]
     assert start.frames[0].labels == paris_folder / "start/train_semantics/0000.png"
-    assert (start.frames[0].camera.fx, start.frames[0].camera.width) == (20, 16)
+    camera = start.frames[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.width) == (20, 22, 7, 9, 16)
     assert capture.parts == {1: "part_1", 2: "part_2"}
 
 
@@ -175,6 +176,33 @@ def test_field_of_view_and_image_size_stand_in_for_missing_intrinsics(capture_fo
     camera = load_capture(capture_folder).states[0].frames[0].camera
     assert (camera.fx, camera.fy) == pytest.approx((16, 16))
     assert (camera.cx, camera.cy, camera.width, camera.height) == (8, 8, 16, 16)
+
+
+def test_each_side_of_an_image_has_its_own_field_of_view_and_centre(capture_folder, edit):
+    def change(meta):
+        for key in ("fl_x", "fl_y", "cx", "cy"):
+            del meta[key]
+        meta.update(w=32, h=16, camera_angle_x=2 * np.arctan(0.5), camera_angle_y=2 * np.arctan(0.2))
+
+    edit(capture_folder / FILE, change)
+    camera = load_capture(capture_folder).states[0].frames[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((32, 40, 16, 8))
+
+
+def test_distortion_params_are_k1_to_k4_then_p1_and_p2(capture_folder, edit):
+    edit(capture_folder / FILE, lambda m: m.update(k1=0.01, k2=0.02, k3=0.03, k4=0.0, p1=0.001, p2=0.002))
+    edit(
+        capture_folder / "state_01/transforms.json",
+        lambda m: m.update(distortion_params=[0.01, 0.02, 0.03, 0.0, 0.001, 0.002]),
+    )
+    by_key, by_list = (state.frames[0].camera.distortion for state in load_capture(capture_folder).states)
+    assert by_key == by_list == (0.01, 0.02, 0.03, 0.0, 0.001, 0.002)
+
+
+def test_a_pose_may_leave_out_its_last_row(capture_folder, edit):
+    expected = load_capture(capture_folder).states[0].frames[0].T_world_camera
+    edit(capture_folder / FILE, lambda m: m["frames"][0]["transform_matrix"].pop())
+    np.testing.assert_array_equal(load_capture(capture_folder).states[0].frames[0].T_world_camera, expected)
 
 
 def test_optional_files_and_points_are_found(capture_folder, edit):
@@ -325,6 +353,12 @@ def test_a_nerfs_synthetic_scene_is_told_what_to_make_of_it(tmp_path, folder):
         InputError, match="transforms_train.json: .*; put the frames of each state into a transforms.json"
     ):
         load_capture(tmp_path / "scene")
+
+
+def test_a_single_frame_without_a_state_is_an_input_error(single_file_folder, edit):
+    edit(single_file_folder / "transforms.json", lambda m: m["frames"][-1].pop("state"))
+    with pytest.raises(InputError, match='carries no "state"'):
+        load_capture(single_file_folder)
 
 
 def test_a_state_folder_alone_is_told_from_a_capture(capture_folder):

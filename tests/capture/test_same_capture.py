@@ -154,6 +154,28 @@ def test_a_fit_reads_the_same_whatever_way_a_capture_came(way, tmp_path):
     assert what_fit_reads(WAYS[way](tmp_path / "other")) == expected
 
 
+@pytest.mark.parametrize(
+    ("layout", "depth"), [(as_artgs, "start/train/depth/0000.png"), (as_dta, "depth_filtered/0_0000.png")]
+)
+def test_depth_is_found_beside_the_images_that_have_it(layout, depth, tmp_path):
+    capture = layout(tmp_path)
+    (capture / "transforms.json").unlink()  # of the import
+    (capture / depth).parent.mkdir()
+    cv2.imwrite(str(capture / depth), np.full((SIZE, SIZE), 1500, np.uint16))
+    first, second = load_capture(capture).states[0].frames[:2]
+    assert (first.depth, second.depth) == (capture / depth, None)
+
+
+def test_keyframes_have_their_own_intrinsics_and_every_eighth_is_for_tests(tmp_path):
+    capture = as_dta(tmp_path)
+    (capture / "transforms.json").unlink()
+    np.savetxt(capture / "cam_K.txt", [[20, 0, 7], [0, 22, 9], [0, 0, 1]])
+    frames = load_capture(capture).states[1].frames
+    camera = frames[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20, 22, 7, 9)
+    assert [frame.split for frame in frames] == ["train"] * 7 + ["test"]
+
+
 def test_damaged_keyframes_are_one_sentence(tmp_path):
     capture = as_dta(tmp_path)
     (capture / "transforms.json").unlink()  # of the import

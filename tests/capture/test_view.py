@@ -166,6 +166,13 @@ def test_points_come_normalised_with_their_colours(tmp_path, coloured):
     assert colours.tolist() == (rgb.tolist() if coloured else [[128] * 3] * 2)
 
 
+def test_points_go_where_the_world_of_their_state_goes(tmp_path):
+    trimesh.PointCloud([[1.0, 2.0, 3.0]]).export(tmp_path / "p.ply")
+    quarter_turn = np.array([[0.0, -2, 0, 5], [2, 0, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]])  # about z, twice as large
+    points, _ = load_points(tmp_path / "p.ply", Normalization(np.zeros(3), 1.0), quarter_turn)
+    torch.testing.assert_close(points, torch.tensor([[1.0, 8.0, 13.0]]))
+
+
 @pytest.mark.parametrize(
     "data", [None, b"", b"ply", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", b"\x80\x04."]
 )
