@@ -248,6 +248,23 @@ def test_large_images_and_those_of_drafts_are_looked_at_smaller_where_enough_is_
                 assert config.pipeline.datamanager.camera_res_scale_factor == 1 / wanted
 
 
+def test_what_is_asked_for_reaches_the_stages(hinge_capture, tmp_path):
+    from splatart_ns.capture.formats import load_capture
+    from splatart_ns.plugin.settings import Settings
+    from splatart_ns.plugin.stage_configs import stage_configs
+
+    capture, settings = load_capture(hinge_capture), Settings("draft", "lid", 7, worlds="similar", refine_cameras="on")
+    *semantic, pose, joint = stage_configs(capture, tmp_path, settings).values()
+    for config in (*semantic, pose, joint):
+        assert (config.machine.seed, config.pipeline.datamanager.dataparser.worlds) == (7, "similar")
+    for config in semantic:
+        assert (config.pipeline.model.refine_cameras, config.pipeline.datamanager.seed) == ("on", 7)
+    assert (pose.pipeline.seed, joint.pipeline.seed) == (7, 7)
+    assert (pose.pipeline.root, joint.pipeline.root) == ("lid", "lid")
+    *_, pose, joint = stage_configs(capture, tmp_path, replace(settings, worlds="shared")).values()
+    assert (pose.pipeline.root, joint.pipeline.root) == (None, "lid")  # poses in one world do not hang on it
+
+
 def test_a_fit_says_how_much_smaller_it_looks_at_images(hinge_capture, tmp_path, monkeypatch, capsys):
     from splatart_ns.plugin import fit as fits
     from splatart_ns.plugin import settings
@@ -325,8 +342,8 @@ class TestResuming:
         from splatart_ns.plugin.report import Report
         from splatart_ns.plugin.settings import Settings
 
-        def make(bundle, capture, quality="draft", root=None, seed=0, rasterizer="auto", joints=()):
-            settings = Settings(quality, root, seed, rasterizer, list(joints))
+        def make(bundle, capture, quality="draft", root=None, seed=0, rasterizer="auto", joints=(), worlds=None):
+            settings = Settings(quality, root, seed, rasterizer, list(joints), worlds)
             return Report(bundle / "report.json", load_capture(capture), settings)
 
         return make
@@ -339,6 +356,12 @@ class TestResuming:
     def test_none_with_other_settings(self, report, fit_copy, hinge_capture, other):
         assert not report(fit_copy, hinge_capture, **other).resume(STAGES[0], whole=True)
         assert finished_stages(fit_copy) == []
+
+    def test_none_with_another_root_that_brought_worlds_together(self, report, hinge_capture, tmp_path):
+        report(tmp_path, hinge_capture, root="lid", worlds="similar").add(STAGES[0], {"seconds": 1.0})
+        for root, known in (("lid", True), ("base", False)):
+            again = report(tmp_path, hinge_capture, root=root, worlds="similar")
+            assert again.resume(STAGES[0], whole=True) == known
 
     def test_none_of_another_version(self, report, fit_copy, hinge_capture, capsys):
         change_json(fit_copy / "report.json", lambda told: told["versions"].update({"splatart-ns": "0.0.1"}))

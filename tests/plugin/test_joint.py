@@ -114,6 +114,25 @@ def test_at_first_the_state_is_shown(state: int) -> None:
         assert torch.allclose(posed[own], world(splat.means[own]) @ T[:3, :3].T + T[:3, 3], atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("kind", "values", "pitch"),
+    [
+        ("screw", [0.0, 0.9], 0.05),
+        ("cylindrical", [[0.0, 0.0], [0.2, 0.9]], 0.0),
+        ("free", [[0.0] * 6, [0.3, 0.5, -0.1, 0.4, -0.2, 0.3]], 0.0),
+    ],
+)
+def test_joints_of_more_than_a_turn_or_a_slide_show_the_state_at_first(kind: str, values: list, pitch: float) -> None:
+    fit = JointFit(kind, torch.eye(3).double()[2], HINGE, pitch, torch.tensor(values).double(), residual=0.0)
+    motions = torch.eye(4).double().repeat(2, 3, 1, 1)
+    motions[:, 1] = fit.motion(fit.values)
+    model, splat = new_model(state=1), splat_of_parts(1, 2, 3)
+    model.start(splat, KinematicTree([1, 2, 3], 1, [Joint(1, 2, fit)]), motions, NORMALIZATION)
+    own, T = splat.part_ids == 2, motions[1, 1]
+    expected = world(splat.means[own]) @ T[:3, :3].T + T[:3, 3]
+    assert torch.allclose(world(model.posed_splat().means[own]), expected, atol=1e-4)
+
+
 def test_a_slider_moves_its_part_and_no_other() -> None:
     model, splat, _ = started_model()
     model.joint_00.default_value = math.degrees(2 * DOOR)
@@ -251,6 +270,29 @@ def test_joints_are_as_sure_where_the_worlds_origin_is_far_away(tmp_path: Path, 
     torch.testing.assert_close(away.values, near.values, atol=1e-6, rtol=0)
     torch.testing.assert_close(away.origin - 1e5, near.origin, atol=1e-5, rtol=0)
     torch.testing.assert_close(away.covariance["values"], near.covariance["values"], rtol=1e-3, atol=0)
+
+
+def test_a_part_that_state_0_hides_is_put_where_another_state_has_it(tmp_path: Path, capture_dir: Path) -> None:
+    state = pose_state()
+    state["_model.covariance"][0, 1] = torch.nan
+    pipeline = joint_pipeline(tmp_path, capture_dir, state, root="base")
+    splat, T = splat_of_parts(1, 2), state["_model.poses.base"][1, 1]
+    moved = splat.means[splat.part_ids == 2].double() @ T[:3, :3].T + T[:3, 3]
+    normalization = pipeline.datamanager.capture.normalization
+    expected = moved / normalization.scale + torch.from_numpy(normalization.centre)
+    assert torch.allclose(pipeline.bundle.parts[1].splat.means.double(), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("parent", "child", "kind"), [(0, 1, "prismatic"), (1, 0, "revolute")])
+def test_a_child_slides_if_its_images_fit_as_well_unturned_against_the_parent(
+    tmp_path: Path, capture_dir: Path, parent: int, child: int, kind: str
+) -> None:
+    state = pose_state()
+    state["_model.poses.base"][1, 1] = se3_exp(torch.tensor([0.3, 0, 0, 0, 0, 0.03]).double())
+    state["_model.held_ratio"][0, 1] = state["_model.held_ratio"][1, 0] = 9.0
+    state["_model.held_ratio"][parent, child] = 1.0
+    (joint,) = joint_pipeline(tmp_path, capture_dir, state, root="base").bundle.joints
+    assert (joint.type, joint.child) == (kind, "lid")
 
 
 def test_joints_of_a_part_that_may_have_turned_otherwise_are_ambiguous(tmp_path: Path, capture_dir: Path) -> None:

@@ -11,7 +11,7 @@ from nerfstudio.engine.trainer import Trainer
 from splatart_ns.capture.check import require_valid
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.errors import InputError
-from splatart_ns.geometry.se3 import se3_exp, so3_log
+from splatart_ns.geometry.se3 import se3_exp, so3_log, transform_points
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.plugin.pose import MOST, RATES, THINNING_PARTS
 from splatart_ns.plugin.semantic_run import read_state
@@ -155,6 +155,24 @@ def test_only_in_one_world_is_what_looks_still_held_still(pose_trainer, monkeypa
     monkeypatch.setattr("splatart_ns.plugin.dataparser.focus_on_focus", lambda *said: replace(said[0], worlds=said[1]))
     pipeline = pose_trainer(worlds=worlds).pipeline
     assert pipeline._frozen[1].tolist() == [worlds == "shared"] * 2
+
+
+def test_a_state_is_brought_to_state_0_from_where_it_was_placed(pose_trainer, monkeypatch):
+    placed, brought = (se3_exp(torch.tensor(x).double()) for x in ([1.0, 0, 0, 0, 0, 0.8], [0, 0.5, 0, 0.6, 0, 0]))
+
+    def beside(capture, worlds):
+        first, second = capture.states
+        return replace(capture, worlds=worlds, states=[first, replace(second, placement=placed.numpy())])
+
+    monkeypatch.setattr("splatart_ns.plugin.dataparser.focus_on_focus", beside)
+    world = WorldFit(brought, torch.zeros(7, 7).double(), 1.0)
+    monkeypatch.setattr("splatart_ns.plugin.pose.fit_worlds", lambda *_: (1, [world]))
+    pipeline = pose_trainer(init="centroids", worlds="rigid").pipeline
+    normalization, x = pipeline.datamanager.capture.normalization, torch.tensor([0.3, -0.2, 0.5]).double()
+    scale, centre = normalization.scale, torch.from_numpy(normalization.centre)
+    normal = scale * (placed[:3, :3] @ x + placed[:3, 3] - centre)
+    expected = (brought[:3, :3] @ normal + brought[:3, 3]) / scale + centre
+    assert torch.allclose(transform_points(pipeline.model.worlds[1], x[None])[0], expected)
 
 
 def test_semantic_runs_that_are_not_one_of_each_state_in_order_are_refused(pose_trainer, semantic_runs):

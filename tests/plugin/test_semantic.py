@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from splatart_ns.capture.seen_surface import SeenSurface
+from splatart_ns.geometry.camera import viewmat_from_opengl
 from splatart_ns.plugin import semantic
 from splatart_ns.plugin.semantic_run import learned_views
 from splatart_ns.stages.camera_refinement import PASSES, TRIED
@@ -280,6 +281,14 @@ def test_refined_cameras_stay_after_an_evaluation_which_loads_images_again(captu
     refined = pipeline.datamanager.train_cameras.camera_to_worlds
     assert not torch.equal(refined, given)
     assert torch.equal(pipeline.datamanager.train_dataset.cameras.camera_to_worlds, refined)
+    assert torch.allclose(viewmat_from_opengl(refined), pipeline.model.viewmats.float(), atol=1e-4)
+
+
+@pytest.mark.parametrize(("asked", "refines"), [("on", True), ("auto", False)])
+def test_cameras_without_contradictions_are_refined_if_that_is_asked_for(capture_dir, semantic_trainer, asked, refines):
+    config = semantic_trainer(capture_dir).config.pipeline
+    config.model.refine_cameras = asked
+    assert config.setup(device="cpu")._refines == refines
 
 
 @pytest.mark.parametrize("now, told", [(3, "and now do so by 3."), (13, "refining them did not help")])

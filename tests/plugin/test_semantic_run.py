@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from splatart_ns.capture.check import require_valid
+from splatart_ns.capture.digest import training_digest
 from splatart_ns.capture.view import load_views
 from splatart_ns.errors import InputError
-from splatart_ns.plugin.semantic_run import find_semantic_runs, learned_views
+from splatart_ns.plugin import semantic_run
+from splatart_ns.plugin.semantic_run import find_semantic_runs, learned_views, read_state
 
 
 def test_semantic_runs_that_are_not_there_are_named_by_state(capture_dir, tmp_path, monkeypatch):
@@ -47,6 +49,25 @@ def test_views_are_seen_as_stage_1_left_them(capture_dir):
     small = learned_views(capture, 0, checkpoint, downscale=2)
     assert [(view.width, *view.rgb.shape[:2]) for view in small] == [(32, 32, 32)] * len(views)
     assert all(view.depth is None for view in seen)
+
+
+def test_opaque_views_show_the_silhouette_of_their_labels_or_of_the_splat(opaque_capture_dir, monkeypatch):
+    capture = require_valid(opaque_capture_dir)
+    views = load_views(capture, 0, "train")
+    ball = {"means": [[0.0] * 3], "scales": [[-1.5] * 3], "quats": [[1.0, 0, 0, 0]], "opacities": [[5.0]]}
+    ball |= {"features_dc": [[0.0] * 3], "features_rest": torch.zeros(1, 0, 3), "semantics": [[-9.0, 9.0, -9.0]]}
+    checkpoint = {f"_model.gauss_params.{name}": torch.as_tensor(value) for name, value in ball.items()} | {
+        "_model.viewmats": torch.stack([view.viewmat for view in views]).double(),
+        "_model.gains": torch.ones(len(views), 3),
+        "_model.trusted": torch.arange(len(views)) > 0,
+        "_model.trained_on": torch.tensor(list(training_digest(capture, 0))),
+        "_model.cameras_refined": torch.tensor(False),
+    }
+    monkeypatch.setattr(semantic_run, "read_checkpoint", lambda *_: checkpoint)
+    unlabelled, *others = read_state(capture, 0, Path("config.yml"), 2, "cpu").views
+    assert unlabelled.labels is None
+    assert (unlabelled.alpha[16, 16], unlabelled.alpha[0, 0]) == (255, 0)  # the ball is where cameras look
+    assert all(torch.equal(view.alpha > 0, view.labels > 0) for view in others)
 
 
 def test_depth_that_no_other_view_confirms_is_left_out(depth_capture_dir):
