@@ -52,6 +52,12 @@ def test_large_parts_are_thinned():
     assert len(contact.points) == 36  # 1 % of 9000 / 5 on either side
 
 
+def test_a_point_passes_by_both_parts():
+    a, b = torch.zeros(200, 3).double(), torch.tensor([3.0, 0.0, 0.0]).double().repeat(200, 1)
+    contact = Contact(0.0, a[:1], (a, b))
+    assert contact.distance_to_point(torch.tensor([1.0, 0.0, 0.0]).double()) == pytest.approx(1 + 2)
+
+
 def test_an_axis_passes_through_what_lies_all_around_it_and_by_what_does_not():
     """A panel with a hole behind a knob: the knob's axis goes through the hole, another passes beside the panel."""
     panel = box((-1.0, -1.0, -0.02), (1.0, 1.0, 0.0))

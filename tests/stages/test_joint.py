@@ -110,6 +110,24 @@ def test_errors_are_as_large_as_their_covariance_says():
     assert 0.6 < sum(value) / 100 < 1.4
 
 
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_axis_and_origin_err_together_as_their_covariance_says(way):
+    scene, small = Scene(4), 0.1
+    T = scene.motions("revolute", [0.0, 0.2 * way, -0.9 * way])
+    about = from_rotation_translation(torch.eye(3, dtype=torch.float64), scene.points.mean(0))
+    here = fit_joint(T, scene.points, object_radius=1.0, types=["revolute"])
+    expected = torch.zeros(3, 3, dtype=torch.float64)
+    for state in (1, 2):
+        for error in torch.linalg.cholesky(surface_noise(scene.points, 0.003, 1.0)).mT:
+            moved = T.clone()
+            moved[state] = T[state] @ about @ se3_exp(small * error) @ inverse(about)
+            there = fit_joint(moved, scene.points, object_radius=1.0, types=["revolute"])
+            expected += torch.outer(there.axis - here.axis, there.origin - here.origin) / small**2
+    expected -= torch.outer(expected @ here.axis, here.axis)  # along itself an axis has no place
+    found = torch.tensor(here.covariance["axis_origin"], dtype=torch.float64)
+    assert (found - expected).norm() < 0.1 * expected.norm()
+
+
 def test_no_nearby_joint_fits_better():
     scene = Scene(2)
     T = scene.motions("revolute", [0.0, 0.8, -0.6], noise=0.003)
@@ -298,6 +316,10 @@ def test_noise_that_was_underestimated_does_not_buy_freedom():
     assert sum(fit.chi2 for fit in fits) / 40 > 5 * 11  # 11 numbers are left over
     loosest = [min(a["score"] for a in fit.alternatives) for fit in fits]
     assert all(score > fit.score for score, fit in zip(loosest, fits, strict=True))
+    squares = [
+        float((fit.values[1] - 0.7) ** 2 / fit.covariance["values"][1][1]) for fit in fits if fit.type == "revolute"
+    ]
+    assert 0.5 < sum(squares) / len(squares) < 1.7  # its errors are told as they are, not as the noise says
 
 
 def test_parts_of_two_points_or_one_are_fitted():

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import torch
 from part_scene import box, motion, photograph
 
@@ -26,6 +28,15 @@ def test_what_one_state_hides_comes_from_another():
     assert torch.cdist(drawer.means, merged[1].means).amin(1).max() < 0.1
     assert len(merged[1]) < 1.1 * len(drawer)
     assert len(merged[0]) < 1.1 * len(base)
+
+
+def test_a_part_is_that_of_the_state_which_shows_most_of_it():
+    dark = box(1, (0.8, 0.8, 0.8), (0.0, 0.0, 0.0))
+    bright = replace(dark, sh=dark.sh + 1)
+    much, little = torch.ones(len(dark)), torch.full((len(dark),), 0.1)
+    for seen, best in (((much, little), dark), ((little, much), bright)):
+        (merged,) = merge_parts([dark, bright], [photograph(dark, 2)] * 2, EYE.repeat(2, 1, 1, 1), seen=seen)
+        assert torch.isin(merged.sh, best.sh).all() and len(merged) > 0.9 * len(dark)
 
 
 def test_background_and_hidden_gaussians_are_left_out():

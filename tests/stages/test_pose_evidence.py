@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from part_scene import angle_deg, motion, nearby, two_states
+from part_scene import angle_deg, motion, nearby, photograph, two_states
 
 from splatart_ns.stages import pose_evidence
 from splatart_ns.stages.joint import PRISMATIC_BELOW
@@ -29,6 +29,21 @@ def test_a_slide_fits_as_well_with_its_rotation_held_and_a_turn_does_not():
 
 def test_a_part_that_turned_far_is_not_suspected_of_sliding():
     assert torch.isnan(held_ratios(motion((0, 0, 40), (0.1, 0.0, 0.0)))).all()
+
+
+def test_a_slide_on_what_turned_is_held_at_its_turn():
+    turn, slid = motion((0, 0, 30), (0.0, 0.1, 0.0)), motion((0, 0, 0.5), (0.3, 0.1, 0.0))
+    splats, (views, _) = two_states(slid)
+    turned = splats[1].transformed(turn)
+    poses = torch.stack([torch.eye(4).double().repeat(2, 1, 1), torch.stack([turn, turn @ slid])])
+    ratios = rotation_held_ratios((splats[0], turned), (views, photograph(turned)), poses)
+    assert ratios[0, 1] < PRISMATIC_BELOW
+
+
+def test_a_pixel_is_as_long_however_coarsely_a_part_is_looked_at():
+    fine, coarse = (part_pair(*two_states(torch.eye(4).double()), 2, 5, pixels) for pixels in (10**6, 20))
+    assert coarse.views[0][0].factor > 1 == fine.views[0][0].factor
+    assert pose_evidence._pixel(coarse) == pytest.approx(pose_evidence._pixel(fine), rel=1e-3)
 
 
 def test_poses_are_refined_but_for_frozen_ones_and_covariances_are_proper():

@@ -2,7 +2,7 @@ import pytest
 import torch
 from part_scene import angle_deg, box, motion, nearby, photograph
 
-from splatart_ns.geometry.se3 import inverse
+from splatart_ns.geometry.se3 import adjoint, inverse
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import reference
 from splatart_ns.stages.merge import merge_parts
@@ -95,6 +95,23 @@ def test_a_pose_at_state_0_that_is_sure_turns_motions_into_those_since_state_0(s
     assert covariances.isfinite().all() and not covariances[0].any()
     # The reference state's own pose is as uncertain as the one that it was turned by.
     assert (torch.linalg.eigvalsh(covariances[1:, 1])[:, 0] > 0).all()
+
+
+def test_a_motion_since_state_0_errs_as_the_poses_there_and_then_do(monkeypatch):
+    C = 1e-6 * torch.eye(6, dtype=torch.float64)
+
+    def refined(splats, views, M, frozen, clear):
+        covariances = C.repeat(*M.shape[:2], 1, 1)
+        covariances[0] = 0  # of the reference state
+        return M, covariances, torch.zeros(M.shape[:2]) > 0
+
+    monkeypatch.setattr(reference, "refine_poses", refined)
+    monkeypatch.setattr(reference, "rotation_held_ratios", lambda *_: torch.full((2, 2), torch.nan))
+    T = torch.stack([torch.stack([EYE, T]) for T in MOVES])
+    splats = [Splat.cat([BASE, PLATE])] * 3
+    _, covariances, *_ = refine_known_poses(splats, [[]] * 3, T, torch.zeros(3, 2) > 0, [0, 1], torch.ones(3, 2) > 0)
+    there = [adjoint(move) @ C @ adjoint(move).mT for move in MOVES]
+    assert torch.allclose(covariances[:, 1], torch.stack([0 * C, there[1], there[2] + C]))
 
 
 def test_how_clearly_gaussians_are_seen_is_measured_where_it_is_not_given(scene, monkeypatch):

@@ -131,6 +131,21 @@ def test_two_drawers_hang_on_the_body_and_close_no_loop(states):
     assert not tree.loops and [{j.parent, j.child} for j in tree.rejected] == [{2, 3}]
 
 
+def test_levers_that_turned_alike_from_one_state_to_another_close_no_loop():
+    """One slides along the other then, but it would not if they had turned otherwise."""
+    pins = [box((x, 0, 0), (0.12, 0.12, 0.5), k) for k, x in enumerate((-0.3, 0.3))]
+    points = {
+        1: torch.cat([*pins, box((0, 0, -0.3), (1.6, 1, 0.1), 4)]),
+        2: box((0.1, 0, -0.05), (0.8, 0.3, 0.12), 5, count=1000),
+        3: box((-0.1, 0, 0.05), (0.8, 0.3, 0.12), 6, count=1000),
+    }
+    joints = [true_joint(1, k, "revolute", Z, (x, 0, 0)) for k, x in ((2, -0.3), (3, 0.3))]
+    motions = motions_of(KinematicTree([1, 2, 3], 1, joints), torch.tensor([[0, 0], [0.3, 0.3]]).double())
+    tree = infer_tree(points, motions, root=1)
+    assert edges(tree) == {(1, 2), (1, 3)} and not tree.loops
+    assert [j.fit.type for j in tree.rejected] == ["prismatic"]
+
+
 @pytest.mark.parametrize("states", [2, 3])
 def test_doors_above_each_other_hang_on_the_body_even_if_nearer_to_each_other(states):
     """They turn about one line, so that the lower could hang on the upper as well."""
@@ -273,6 +288,20 @@ def test_a_part_that_stood_still_lends_its_joint_no_error():
     fits = fit_pairs(points, motions, 1.0, covariances=covariances, noise=1e-5, types=["revolute"])
     for fit in fits.values():
         assert math.degrees(math.asin(float(torch.linalg.vector_norm(fit.axis[:2])))) < 0.01
+
+
+def test_a_joint_is_no_surer_than_what_it_hangs_on():
+    points = {p: box((0.7 * p, 0, 0), (0.5, 0.4, 0.3), p) for p in (1, 2, 3)}
+    truth = KinematicTree([1, 2, 3], 1, [true_joint(k, k + 1, "revolute", Z, (0.7 * k, 0, 0)) for k in (1, 2)])
+    motions = motions_of(truth, torch.tensor([[0, 0], [0.7, 0.5]]).double())
+
+    def deviation(of_parent):
+        sigmas = {1: 1e-4, 2: of_parent, 3: 1e-4}
+        covariances = {p: sigma**2 * torch.eye(6).double().repeat(2, 1, 1) for p, sigma in sigmas.items()}
+        fit = fit_pairs(points, motions, 1.0, covariances=covariances, noise=1e-5, types=["revolute"])[2, 3]
+        return fit.covariance["values"][1][1] ** 0.5
+
+    assert deviation(1e-2) > 0.5e-2 > 10 * deviation(1e-4)
 
 
 def test_parts_that_hang_together_but_on_nothing_else_are_carried_by_a_free_joint():

@@ -67,6 +67,18 @@ def test_the_axis_of_a_knob_on_a_door_is_no_surer_than_where_the_door_is():
     assert all(variance > 1e-3 for variance in torch.tensor(knob.fit.covariance["axis"]).diagonal()[[0, 2]])
 
 
+def test_a_tilt_beside_the_centre_of_a_disc_moves_centre_and_axis_together():
+    points, motions, covariances = round_part_and_door()
+    tilt = torch.cat([torch.linalg.cross(points[2].mean(0) + 0.5 * X, Y), Y])
+    covariances[2][1] += 0.01 * tilt.outer(tilt)
+    tree = infer_tree(points, motions, covariances=covariances)
+    disc = next(j.fit for j in tree.joints if j.child == 2)
+    assert disc.covariance["axis"][2][2] == pytest.approx(0.01, rel=0.05)
+    assert disc.covariance["origin"][2][2] == pytest.approx(0.01 * 0.5**2, rel=0.05)
+    # The centre rises as the end of X sinks.
+    assert disc.covariance["axis_origin"][2][2] * float(disc.axis[0]) == pytest.approx(-0.01 * 0.5, rel=0.05)
+
+
 @pytest.mark.parametrize(("degrees", "kind"), [([-35], "revolute"), ([25, -35], "revolute"), ([12], "fixed")])
 def test_a_disc_that_hardly_shows_how_far_it_turned_turns_if_it_did_so_by_two_deviations(degrees, kind):
     points, motions, covariances = round_part_and_door()
