@@ -23,8 +23,9 @@ from splatart_ns.stages.visibility import MAX_VIEWS
 
 EXTENT = 2.0
 """How far out a Gaussian must be clear of the background, in standard deviations."""
-OFTEN = 0.1
-"""What a larger share of a state's views show in its free space is not there."""
+OFTEN, MOSTLY = 0.1, 0.5
+"""What a larger share of a state's views, or of those that look there, show in its free space is not there: above an
+object in a room faint Gaussians hung where one or two views look."""
 FEW = 0.1
 """Where a larger share of a part's Gaussians is not there, its pose is rather wrong, or the silhouettes are."""
 MOST = 0.5
@@ -64,12 +65,13 @@ class FreeSpace:
         return reached.any(1)
 
     def holds(self, points: Tensor) -> Tensor:
-        """Which points [N, 3] `OFTEN` show in it [N] bool."""
-        times = torch.zeros(len(points), device=points.device)
+        """Which points [N, 3] `OFTEN`, or wherever they are in the image `MOSTLY`, show in it [N] bool."""
+        looks, times = torch.zeros(2, len(points), device=points.device)
         for view, empty in zip(self.views, self.empty, strict=True):
             column, row, _, inside = project(view, points)
+            looks += inside
             times += inside & empty[row, column]
-        return times > OFTEN * len(self.views)
+        return (times > OFTEN * len(self.views)) | (times > MOSTLY * looks)
 
 
 def strays(splat: Splat, free: Sequence[FreeSpace], T: Tensor, known: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ import pytest
 import torch
 from part_scene import box, motion, photograph
 
+from splatart_ns.capture.hull import project
 from splatart_ns.geometry.se3 import inverse, se3_log
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import pose_evidence
@@ -134,3 +135,13 @@ def test_what_one_state_hides_and_another_shows_in_free_space_is_a_stray():
     # A pose that brings a fifth of a part there is not believed.
     poses[1, 1] = motion((0, 0, 0), (0.3, 0.5, 0.0))
     assert not strays(splat, free, poses, known).any()
+
+
+def test_what_hangs_where_few_views_look_is_a_stray_if_they_show_nothing_there():
+    thing = box(1, (0.6, 0.9, 0.5), (0.0, 0.0, 0.0))
+    views = photograph(thing, 24, 96)
+    above = torch.tensor([[0.0, 0.0, 5.0], [0.0, 0.0, 6.0]])
+    assert sum(project(view, above)[3].int() for view in views).tolist() == [2, 2]
+    free = FreeSpace.of(views)
+    assert free.holds(above).all() and not free.holds(thing.means).any()
+    assert not FreeSpace.of(views[:0]).holds(above).any()  # where nobody looks, nothing is known
