@@ -110,7 +110,7 @@ class SplatartModel(SplatfactoModel):
         self.step = 0
         self._told_within_rendered = False
         self.crop_box = None
-        self.background_color = {"black": torch.zeros(3)}.get(self.config.background_color, torch.ones(3))
+        self.background_color = torch.ones(3)  # of what is not training, where that is on random colours
 
     @property
     def splat(self) -> Splat:

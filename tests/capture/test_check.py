@@ -276,7 +276,7 @@ def test_names_that_are_made_fit_for_files_are_told_once(capture_folder, edit):
         edit(capture_folder / f"state_0{k}/transforms.json", lambda m, change=change: m.update(change))
     (problem,) = check_capture(capture_folder)[1]
     assert problem.severity == "warning" and problem.file == capture_folder / "state_00/transforms.json"
-    assert problem.message.endswith("'left door/T\u00fcr' is called left_door_T_r")
+    assert problem.message.endswith("'left door/T\u00fcr' is called left_door_Tur")
 
 
 def test_no_labels_at_all_is_one_error(capture_folder):
