@@ -77,11 +77,15 @@ def safe_names(names: Sequence[str]) -> list[str]:
     return [out[i] for i in range(len(names))]
 
 
+def in_ascii(name: str) -> str:
+    """Without accents, and without letters that are not Latin."""
+    return unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+
+
 def _safe(name: str) -> str:
     """Without accents, and `_` for what else is not allowed between letters; may be empty."""
     if re.fullmatch(r"[A-Za-z0-9_.-]*", name) is None:
-        plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
-        name = re.sub(r"[^A-Za-z0-9_.-]+", "_", plain).strip("_")
+        name = re.sub(r"[^A-Za-z0-9_.-]+", "_", in_ascii(name)).strip("_")
     return name[:64].lstrip(".-").rstrip(".")
 
 

@@ -25,7 +25,7 @@ EXTENT = 2.0
 """How far out a Gaussian must be clear of the background, in standard deviations."""
 OFTEN, MOSTLY = 0.1, 0.5
 """What a larger share of a state's views, or of those that look there, show in its free space is not there: above an
-object in a room faint Gaussians hung where one or two views look."""
+object in a room faint Gaussians hung where few views look."""
 FEW = 0.1
 """Where a larger share of a part's Gaussians is not there, its pose is rather wrong, or the silhouettes are."""
 MOST = 0.5

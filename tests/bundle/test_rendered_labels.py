@@ -4,6 +4,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from small_capture import give_another_world
 
 from splatart_ns.bundle import load_bundle
 from splatart_ns.bundle.rendered_labels import write_labels
@@ -50,14 +51,7 @@ def test_unlabelled_frames_get_the_parts_they_show_and_import_takes_them(
 def test_states_with_worlds_of_their_own_have_the_same_labels(hinge_fit, sparse_capture, tmp_path):
     bundle = load_bundle(hinge_fit)
     write_labels(bundle, load_capture(sparse_capture), tmp_path / "shared")
-    world = np.array([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
-    file = sparse_capture / "state_01/transforms.json"
-    meta = json.loads(file.read_text())
-    for frame in meta["frames"]:
-        T = world @ np.array(frame["transform_matrix"])
-        T[:3, :3] /= 2
-        frame["transform_matrix"] = T.tolist()
-    file.write_text(json.dumps(meta))
+    world = give_another_world(sparse_capture / "state_01")
     bundle.provenance["worlds"] = [np.eye(4).tolist(), np.linalg.inv(world).tolist()]
     write_labels(bundle, load_capture(sparse_capture), tmp_path / "own")
     for expected in (tmp_path / "shared/labels").rglob("*.png"):

@@ -58,3 +58,15 @@ def write_state(folder: Path, **extra: Any) -> None:
     splits = {"train_filenames": names[:6], "val_filenames": names[6:], "test_filenames": names[6:]}
     meta = {**intrinsics(), "semantic_classes": ["background", "base", "door"], **splits, "frames": entries, **extra}
     (folder / "transforms.json").write_text(json.dumps(meta))
+
+
+def give_another_world(state: Path) -> np.ndarray:
+    """Write the poses of a state's `transforms.json` in another world, and return the similarity [4, 4] to that."""
+    world = np.array([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
+    meta = json.loads((state / "transforms.json").read_text())
+    for frame in meta["frames"]:
+        T = world @ np.array(frame["transform_matrix"])
+        T[:3, :3] /= 2
+        frame["transform_matrix"] = T.tolist()
+    (state / "transforms.json").write_text(json.dumps(meta))
+    return world

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from rich.console import Console
+from small_capture import give_another_world
 
 from splatart_ns.bundle import save_bundle
 from splatart_ns.capture.digest import capture_identity
@@ -155,14 +156,7 @@ def test_states_with_worlds_of_their_own_are_scored_in_the_bundles(bundle, folde
     copy = Path(shutil.copytree(capture, tmp_path / "capture"))
     (copy / "ground_truth.json").unlink()
     shutil.rmtree(copy / "eval")
-    world = np.array([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
-    file = copy / "state_01/transforms.json"
-    meta = json.loads(file.read_text())
-    for frame in meta["frames"]:
-        T = world @ np.array(frame["transform_matrix"])
-        T[:3, :3] /= 2
-        frame["transform_matrix"] = T.tolist()
-    file.write_text(json.dumps(meta))
+    world = give_another_world(copy / "state_01")
     bundle.provenance["worlds"] = [np.eye(4).tolist(), np.linalg.inv(world).tolist()]
     save_bundle(bundle, folder)
     assert min(scores["psnr"] for scores in evaluate(folder, copy)["images"].values()) > 45

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-import unicodedata
 from collections.abc import Iterable
+
+from splatart_ns.capture.part_names import in_ascii
 
 RESERVED = ("world", "joints", "scene", "material", "z_up")
 """MuJoCo's name of what does not move, the neighbours of the links in a USD file, and the root's parent in a GLB."""
@@ -12,8 +13,7 @@ RESERVED = ("world", "joints", "scene", "material", "z_up")
 
 def identifier(name: str) -> str:
     """`name` in ASCII letters, digits and underscores, not beginning with a digit: an identifier of XML and USD."""
-    ascii_name = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
-    cleaned = re.sub(r"[^A-Za-z0-9_]+", "_", ascii_name).strip("_") or "unnamed"
+    cleaned = re.sub(r"[^A-Za-z0-9_]+", "_", in_ascii(name)).strip("_") or "unnamed"
     return f"_{cleaned}" if cleaned[0].isdigit() else cleaned
 
 
