@@ -29,10 +29,13 @@ from splatart_ns.records import read_record
 
 
 @torch.no_grad()
-def evaluate(bundle_folder: Path, capture_path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+def evaluate(
+    bundle_folder: Path, capture_path: Path, device: torch.device | str = "cpu", meshes: bool = True
+) -> dict[str, Any]:
     """Score a bundle and write `metrics.json` into its folder; returns what the file holds. Renders on `device`.
 
-    A capture without `ground_truth.json` gives image metrics only. Raises InputError for unusable input.
+    Without `meshes`, which take the most seconds, "geometry" has the figures of the Gaussians' centres alone. A capture
+    without `ground_truth.json` gives image metrics only. Raises InputError for unusable input.
     """
     bundle_folder, capture_path = Path(bundle_folder), Path(capture_path)
     bundle = load_bundle(bundle_folder)
@@ -69,7 +72,7 @@ def evaluate(bundle_folder: Path, capture_path: Path, device: torch.device | str
     if truth is None:
         notes.append("joints, structure, parts, geometry: the capture has no ground_truth.json")
     else:
-        _score_model(metrics, notes, bundle, truth, len(capture.states), capture_path)
+        _score_model(metrics, notes, bundle, truth, len(capture.states), capture_path, meshes)
     novel = load_novel(capture_path)
     _score_images(metrics, notes, bundle, truth, capture, novel, device)
     fitted = fitted_residuals(bundle, capture) if novel else {}
@@ -90,6 +93,7 @@ def _score_model(
     truth: GroundTruth,
     num_states: int,
     capture_path: Path,
+    meshes: bool,
 ) -> None:
     if len(truth.motions[truth.root]) != num_states:
         raise InputError(
@@ -104,9 +108,10 @@ def _score_model(
     metrics["joints_mean"] = mean_errors(metrics["joints"])
     metrics["structure"] = structure_scores(truth, bundle)
     metrics["parts"] = part_pose_errors(truth, bundle)
-    metrics["geometry"]["centres"] = chamfer_centres(truth, bundle)
-    metrics["geometry"]["mesh"] = chamfer_mesh(truth, bundle)
-    for of, figures in metrics["geometry"].items():
+    geometry = {"mesh": chamfer_mesh(truth, bundle)} if meshes else {}
+    geometry["centres"] = chamfer_centres(truth, bundle)
+    metrics["geometry"] |= geometry
+    for of, figures in geometry.items():
         if lost := [name for name, value in figures["parts"].items() if value is None]:
             notes.append(f"geometry.{of}: nothing is shown of {', '.join(lost)}; means that it belongs to are null")
     few = [name for part, name in truth.parts.items() if len(truth.points[part]) < SAMPLES]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import bench
 import pytest
-from bench_plan import FULL, QUICK, SLOW_GROUPS, Scene, growths, trade_offs
+from bench_plan import FULL, QUICK, SLOW_GROUPS, Point, Scene, growths, trade_offs
 from bench_report import write_report
 from drawers_urdf import write_drawers
 from fit_with import apply, parse
@@ -137,6 +137,15 @@ def test_growth_and_profile_are_told(tmp_path):
     text = written(tmp_path, plan, records)
     assert "| parts | 2 to 8 | all | 4 to 16 | 1.00 | 1.00 | 900 to 900 |" in text
     assert "Outside rasterization and image losses: **30%**" in text and "| rasterization | 6.0 | 60.0% |" in text
+
+
+def test_a_fit_is_run_with_its_settings_and_scored(tmp_path):
+    scene = Scene("tiny", "random-102-2", tuple("--resolution 64 --train-views 10 --test-views 1".split()))
+    few = Point("iterations", "few", scene, settings=("effort.steps=60", "effort.merge_steps=20"))
+    found = bench.run(few, tmp_path)
+    assert found.get("failed") is None and found["errors"].keys() == record(few, 1.0, 1.0)["errors"].keys()
+    assert 0 < found["errors"]["image"] < 0.5 and found["settings"] == list(few.settings)
+    assert "1 fits of 1 planned" in written(tmp_path, [few], [found])
 
 
 def test_finished_fits_are_read_back_and_half_a_line_is_not(tmp_path):

@@ -52,6 +52,12 @@ def test_a_perfect_estimate_scores_perfectly(folder, capture):
     assert json.loads((folder / "metrics.json").read_text())["joints"] == metrics["joints"]
 
 
+def test_meshes_may_be_left_out(folder, capture):
+    metrics = evaluate(folder, capture, meshes=False)
+    assert metrics["geometry"]["mesh"] is None and metrics["geometry"]["centres"]["CD-w"] is not None
+    assert "CD-w" in printed(metrics)
+
+
 def test_another_capture_than_the_fitted_one_is_told(folder, capture, tmp_path):
     """Its parts and states may be called alike, and what it shows be another configuration."""
     fitted = capture_identity(load_capture(capture))
