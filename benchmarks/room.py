@@ -25,6 +25,7 @@ from fit_table import COLUMNS, figures, splatart
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from skimage.measure import find_contours
 from spoil import another_world, jittered, placed_in
 
 from splatart_ns.capture.capture import Camera
@@ -212,8 +213,11 @@ def write_polygons(folder: Path, labelled: int) -> Path:
 
 def _outlines(mask: np.ndarray) -> list[list[float]]:
     """Polygons about a part's pieces as a person draws them: few corners, within a pixel, holes left out of sight."""
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    drawn = [cv2.approxPolyDP(c, 0.8, True)[:, 0] + 0.5 for c in contours if cv2.contourArea(c) > 4]
+    # Along pixels' borders: contours through the centres of the outermost pixels would be half a pixel too small.
+    around = np.pad(mask, 1).astype(float)
+    contours = [c[:-1, ::-1].astype(np.float32) - 0.5 for c in find_contours(around, 0.5, fully_connected="low")]
+    outer = [c for c in contours if cv2.contourArea(c, oriented=True) > 4]
+    drawn = [cv2.approxPolyDP(c[:, None], 0.8, True)[:, 0] for c in outer]
     return [polygon.ravel().tolist() for polygon in drawn if len(polygon) >= 3]
 
 

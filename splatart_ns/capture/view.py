@@ -59,6 +59,8 @@ class View:
     """bool [H, W], the pixels that count in the loss."""
     depth: Tensor | None = None
     """float32 [H, W], along the optical axis in the normalised world; 0 where unknown."""
+    outlined_by_splat: bool = False
+    """Whether `alpha` is not what somebody gave, but rendered from the state's own splat."""
 
     def to(self, device: torch.device | str) -> View:
         """The view with its tensors on a device."""

@@ -49,6 +49,8 @@ class PartView:
     area: float
     """Number of the part's own pixels at full size."""
     factor: int
+    outlined_by_splat: bool = False
+    """Whether the silhouette is rendered from the state's own splat."""
 
     def render(self, splat: Splat, T: Tensor, first_order: bool = False) -> Tensor:
         """The splat under motions or similarities [K, 4, 4]: [K, H, W, 4], colours over black and accumulation.
@@ -135,6 +137,7 @@ def part_view(
         weight=weight.to(device),
         area=float(own.sum()),
         factor=factor,
+        outlined_by_splat=view.outlined_by_splat,
     )
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from splatart_ns.geometry.se3 import from_rotation_translation, skew, so3_exp, transform_points
+from splatart_ns.geometry.similarity import rigid_of
 from splatart_ns.stages.part_pair import HUBER, PartPair, huber
 
 STEP = 5e-4
@@ -135,8 +136,9 @@ def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | No
     translation is that of the world's origin. A sandwich estimate with views as clusters (Liang and Zeger 1986):
     neighbouring pixels err together (edges, shadows, a mixed Gaussian), so each view counts as one observation, however
     many pixels it has. Views of one state share the other state's Gaussians and err together too: what the two
-    directions disagree by is added. A prior with a standard deviation of half a turn, and of pi radii, keeps finite
-    what no image shows, like the turn of a plain round part about its axis.
+    directions disagree by is added, and what rendered silhouettes do not show (`_outline_covariance`). A prior with a
+    standard deviation of half a turn, and of pi radii, keeps finite what no image shows, like the turn of a plain round
+    part about its axis.
     """
     T = T.double()
     equations = equations or normal_equations(pair, T, 6)
@@ -147,6 +149,7 @@ def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | No
     directions = torch.stack([d.sum(0) for d in g.split([len(pair.views[1]), len(pair.views[0])])])
     H_inv = torch.linalg.inv(equations.H.sum(0) + variance / math.pi**2 * torch.eye(n).to(T))
     local = H_inv @ (V / max(V - n, 1) * g.T @ g + directions.T @ directions) @ H_inv + variance * H_inv
+    local += _outline_covariance(pair, T, n)
     # From (radii, radians) about the moved centroid to the world's origin.
     pivot = transform_points(T, pair.centroid[None])[0]
     A = torch.eye(max(n, 6), n, dtype=T.dtype, device=T.device)
@@ -156,6 +159,30 @@ def motion_covariance(pair: PartPair, T: Tensor, equations: NormalEquations | No
     if n == 7:
         A[:3, 6] = -pivot
     return A @ local @ A.T
+
+
+def _outline_covariance(pair: PartPair, T: Tensor, n: int) -> Tensor:
+    """What a refined motion T [4, 4] is uncertain by besides [n, n], where silhouettes are rendered from splats: in
+    radii and radians about the moved centroid.
+
+    All these err as their splat does, alike in all views, which their residuals do not show. Where its Gaussians ought
+    to be, the views say whose outlines were given: of their own state, they are few, and each errs for itself. How far
+    they scatter about what their equations allow is one factor (overdispersion, McCullagh and Nelder 1989, chapter 4),
+    for too few views leave a sandwich without some directions.
+    """
+    total = torch.zeros(n, n).to(T)
+    to_target = torch.block_diag(*[rigid_of(T)[:3, :3]] * 2, torch.eye(1).to(T))[:n, :n]
+    places = (pair.centroid, to_target), (transform_points(T, pair.centroid[None])[0], torch.eye(n).to(T))
+    for splat, views, (centroid, turn) in zip(pair.splats, pair.views, places, strict=True):
+        given = tuple(view for view in views if not view.outlined_by_splat)
+        if not given or len(given) == len(views):
+            continue
+        own = replace(pair, splats=(splat, splat), views=((), given), centroid=centroid)
+        equations = normal_equations(own, torch.eye(4).to(T), n)
+        H_inv = turn @ torch.linalg.inv(equations.H.sum(0) + 1e-9 * torch.eye(n).to(T)) @ turn.T
+        g = equations.g @ turn.T
+        total += H_inv * ((g @ H_inv) * g).sum() / n * len(given) / max(len(given) - 1, 1)
+    return total
 
 
 def shifted(pair: PartPair, T: Tensor, R: Tensor | None = None) -> Refinement:

@@ -39,7 +39,7 @@ def rendered_silhouette(view: View, splat: Splat) -> View:
     """
     share = 1 - _shares(view, splat)[..., 0]
     alpha = (0.5 + STEEPER * (share - 0.5)).clamp(0, 1)
-    return replace(view, alpha=(255 * alpha).round().to(torch.uint8))
+    return replace(view, alpha=(255 * alpha).round().to(torch.uint8), outlined_by_splat=True)
 
 
 SHOWN = 0.1

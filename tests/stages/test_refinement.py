@@ -79,6 +79,29 @@ def test_the_covariance_covers_the_error():
     assert xi.norm() > 1e-4
 
 
+@pytest.mark.parametrize("state", [0, 1])
+def test_where_outlines_are_rendered_those_that_were_given_say_how_far_the_splat_may_be_off(state):
+    splats, views = two_states(TURN)
+    off = motion((1.0, 0, -1.0), (0.02, -0.01, 0.01))
+    splats, views = list(splats), [list(of_state) for of_state in views]
+    splats[state] = splats[state].transformed(off)
+    rendered = [replace(view, outlined_by_splat=True) for view in photograph(splats[state])]
+    views[state] = [
+        given if k % 3 == 0 else own for k, (given, own) in enumerate(zip(views[state], rendered, strict=True))
+    ]
+
+    def deviations(of_views) -> float:
+        pair = part_pair(tuple(splats), of_views, 2, num_views=10, pixels=5000)
+        T = refine(pair, TURN, 15).T
+        xi = se3_log(T @ inverse(TURN))
+        assert xi[:3].norm() > 0.005
+        return float((xi @ torch.linalg.solve(motion_covariance(pair, T), xi)).sqrt())
+
+    told = deviations(tuple(views))
+    untold = deviations(tuple([replace(view, outlined_by_splat=False) for view in some] for some in views))
+    assert told < 3.5 < untold  # 95 % of six unknowns
+
+
 def test_a_tiny_part_turns_less_certainly_than_a_large_one():
     def sigma(size: float) -> float:
         part = box(2, (size, 0.6 * size, 0.5 * size), (0.0, 0.0, 0.0), spacing=size / 8)
