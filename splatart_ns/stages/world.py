@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from splatart_ns.capture.view import View
-from splatart_ns.geometry.se3 import inverse, so3_log
+from splatart_ns.geometry.se3 import from_rotation_translation, inverse, so3_exp, so3_log
 from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_of, similarity, view_of_moved
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.flush import is_flush
@@ -39,6 +39,9 @@ MATCHED = 0.7
 TELLING = 0.8
 """Of turns that fit alike, one is right after which surroundings are less than this many times as far apart as after
 the others: in a room a fridge's measured 0.46 times and a safe's 0.67, beside rough turns by a right angle."""
+
+SWEEP = 15
+"""Degrees between turns that are tried first: a bucket's room is nearest over 40."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,9 @@ def fit_world(
         rivals = [end.T for end in ends if end.cost < ALIKE * ends[0].cost]
         doubtful = any(_quite_other(rival, T) for rival in rivals)
         if doubtful and around is not None:
+            if (swept := _swept(around, rivals, zoom, points[0])) is not None:
+                end = refine(fine, swept, FEW, with_scale=with_scale)
+                rivals += [end.T] if end.cost < ALIKE * ends[0].cost else []
             apart = [surroundings_apart(around, inverse_similarity(r) @ zoom.to(r), points[0]) for r in rivals]
             best = min(range(len(rivals)), key=apart.__getitem__)
             others = [a for a, r in zip(apart, rivals, strict=True) if _quite_other(r, rivals[best])]
@@ -112,6 +118,33 @@ def fit_world(
 def _quite_other(a: Tensor, b: Tensor) -> bool:
     """Whether two similarities [4, 4] turn quite otherwise."""
     return bool(so3_log((rigid_of(a) @ inverse(rigid_of(b)))[:3, :3]).norm() > OTHERWISE)
+
+
+def _swept(around: tuple[Splat, Splat], rivals: Sequence[Tensor], zoom: Tensor, part: PartPoints) -> Tensor | None:
+    """The first of similarities [4, 4] by which a part looks alike, turned to where surroundings are nearest about the
+    axes by which the others are turned against it: of a round part all turns look alike, and few are among them.
+
+    None where too little is near.
+    """
+    first, *others = rivals
+    pivot = torch.from_numpy(part.centroid).to(first)
+    turns = [so3_log(rigid_of(inverse_similarity(first) @ r)[:3, :3]) for r in others if _quite_other(r, first)]
+
+    def turned(turn: Tensor) -> Tensor:
+        R = so3_exp(turn)
+        return first @ from_rotation_translation(R, pivot - R @ pivot)
+
+    def apart(turn: Tensor) -> float:
+        return surroundings_apart(around, inverse_similarity(turned(turn)) @ zoom.to(first), part)
+
+    axes = [turn / turn.norm() for turn in turns]
+    coarse, axis = min(((a, axis) for axis in axes for a in torch.arange(0, 360, SWEEP)), key=lambda x: apart(_at(*x)))
+    nearest = min((_at(a, axis) for a in coarse + torch.arange(1 - SWEEP, SWEEP)), key=apart)
+    return turned(nearest) if apart(nearest) < math.inf else None
+
+
+def _at(degrees: Tensor, axis: Tensor) -> Tensor:
+    return degrees.deg2rad().to(axis) * axis
 
 
 def surroundings_apart(around: tuple[Splat, Splat], T: Tensor, part: PartPoints) -> float:
