@@ -39,7 +39,6 @@ MATCHED = 0.7
 TELLING = 0.8
 """Of turns that fit alike, one is right after which surroundings are less than this many times as far apart as after
 the others: in a room a fridge's measured 0.46 times and a safe's 0.67, beside rough turns by a right angle."""
-
 SWEEP = 15
 """Degrees between turns that are tried first: a bucket's room is nearest over 40."""
 
@@ -130,21 +129,16 @@ def _swept(around: tuple[Splat, Splat], rivals: Sequence[Tensor], zoom: Tensor, 
     pivot = torch.from_numpy(part.centroid).to(first)
     turns = [so3_log(rigid_of(inverse_similarity(first) @ r)[:3, :3]) for r in others if _quite_other(r, first)]
 
-    def turned(turn: Tensor) -> Tensor:
-        R = so3_exp(turn)
+    def turned(axis: Tensor, degrees: int) -> Tensor:
+        R = so3_exp(math.radians(degrees) * axis)
         return first @ from_rotation_translation(R, pivot - R @ pivot)
 
-    def apart(turn: Tensor) -> float:
-        return surroundings_apart(around, inverse_similarity(turned(turn)) @ zoom.to(first), part)
+    def apart(turn: tuple[Tensor, int]) -> float:
+        return surroundings_apart(around, inverse_similarity(turned(*turn)) @ zoom.to(first), part)
 
-    axes = [turn / turn.norm() for turn in turns]
-    coarse, axis = min(((a, axis) for axis in axes for a in torch.arange(0, 360, SWEEP)), key=lambda x: apart(_at(*x)))
-    nearest = min((_at(a, axis) for a in coarse + torch.arange(1 - SWEEP, SWEEP)), key=apart)
-    return turned(nearest) if apart(nearest) < math.inf else None
-
-
-def _at(degrees: Tensor, axis: Tensor) -> Tensor:
-    return degrees.deg2rad().to(axis) * axis
+    axis, rough = min(((t / t.norm(), degrees) for t in turns for degrees in range(0, 360, SWEEP)), key=apart)
+    nearest = min(((axis, degrees) for degrees in range(rough - SWEEP + 1, rough + SWEEP)), key=apart)
+    return turned(*nearest) if apart(nearest) < math.inf else None
 
 
 def surroundings_apart(around: tuple[Splat, Splat], T: Tensor, part: PartPoints) -> float:
