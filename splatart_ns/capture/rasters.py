@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 _EDGES_AT_ONCE = 256
+_TRACED_CORNERS = 8
+"""Fewer may lie on such lines by chance."""
 
 
 def fill_polygon(image: np.ndarray, corners: np.ndarray, value: int) -> None:
@@ -15,7 +18,13 @@ def fill_polygon(image: np.ndarray, corners: np.ndarray, value: int) -> None:
     Corners are x, y in pixels from the image's upper left corner; the centre of the first pixel is (0.5, 0.5). So
     polygons that share an edge share no pixel and leave none between them, and one that runs along pixel borders is
     exact. (OpenCV's fillPoly also takes the pixels that an edge touches.)
+
+    But a contour of a mask by OpenCV's findContours, which annotation tools write down as a polygon, runs through the
+    centres of the outermost pixels and counts from the first pixel's: what it runs through is its mask's, too.
     """
+    if _is_traced(corners, *image.shape):
+        image[cv2.fillPoly(np.zeros(image.shape, np.uint8), [np.rint(corners).astype(np.int32)], 1) > 0] = value
+        return
     # The first pixels whose centre is not before a corner, all in a window of the image around the polygon.
     height, width = image.shape
     after = np.ceil(np.clip(corners - 0.5, 0, [width, height])).astype(int)
@@ -34,6 +43,24 @@ def fill_polygon(image: np.ndarray, corners: np.ndarray, value: int) -> None:
         np.bitwise_xor.at(flips, (row - top, column - left), 1)
     inside = np.bitwise_xor.accumulate(flips, axis=1)[:, :-1].astype(bool)
     image[top:bottom, left:right][inside] = value
+
+
+def _is_traced(corners: np.ndarray, height: int, width: int) -> bool:
+    """Whether a polygon goes from pixel to pixel along rows, columns and diagonals, as OpenCV's contours do.
+
+    One along pixel borders has no diagonals, and one drawn by hand has others. YOLO's shares are rounded.
+    """
+    pixels = np.rint(corners)
+    across, down = np.abs(np.roll(pixels, -1, axis=0) - pixels).T
+    slanted = (across > 0) & (down > 0)
+    return (
+        len(corners) >= _TRACED_CORNERS
+        and np.abs(corners - pixels).max() < 0.01
+        and slanted.any()
+        and (across == down)[slanted].all()
+        and pixels.min() >= 0
+        and (pixels < [width, height]).all()
+    )
 
 
 def decode_runs(counts: Sequence[int], width: int, height: int) -> np.ndarray:

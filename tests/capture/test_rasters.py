@@ -24,12 +24,13 @@ def test_a_polygon_takes_the_pixels_whose_centre_it_holds():
 def test_a_polygon_agrees_with_the_centres_tested_one_by_one():
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:40, :50] + 0.5
-    for n in (3, 5, 9, 600):
-        corners = rng.uniform(-20, 70, (n, 2))
+    beyond = np.array([[2, 0], [8, 0], [10, 2], [50, 2], [50, 36], [46, 40], [2, 40], [0, 38], [0, 2]], float)
+    drawn = [rng.uniform(-20, 70, (n, 2)) for n in (3, 5, 9, 600)]
+    for corners in (*drawn, rng.integers(0, 40, (9, 2)).astype(float), beyond, beyond - 2):
         crossings = np.zeros((40, 50), int)
         for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
             with np.errstate(divide="ignore", invalid="ignore"):
-                crossings += ((y0 > y) != (y1 > y)) & (x > x0 + (y - y0) / (y1 - y0) * (x1 - x0))
+                crossings += ((y0 > y) != (y1 > y)) & (x >= x0 + (y - y0) / (y1 - y0) * (x1 - x0))
         np.testing.assert_array_equal(fill_polygon(corners, 50, 40), crossings % 2 == 1)
 
 
@@ -54,6 +55,38 @@ def test_polygons_agree_with_pycocotools_but_for_pixels_on_the_edge():
     differ = fill_polygon(corners, 100, 100) != theirs
     edge = cv2.polylines(np.zeros((100, 100), np.uint8), [np.rint(corners).astype(np.int32)], True, 1, 3)
     assert not differ[edge == 0].any() and differ.sum() < 200
+
+
+def blobs(seed):
+    """A mask [90, 120] of a few smooth blobs without holes, some at the border."""
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=(90, 120)), (0, 0), 6)
+    found = cv2.findContours((noise > 0.03).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    large = [c for c in found if cv2.contourArea(c) > 30]
+    return cv2.drawContours(np.zeros((90, 120), np.uint8), large, -1, 1, cv2.FILLED).astype(bool)
+
+
+@pytest.mark.parametrize("approximation", [cv2.CHAIN_APPROX_NONE, cv2.CHAIN_APPROX_SIMPLE])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_contour_of_a_mask_by_opencv_is_the_mask(seed, approximation):
+    mask = blobs(seed)
+    contours = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, approximation)[0]
+    assert len(contours) > 1
+    again = np.zeros(mask.shape, bool)
+    for contour in contours:
+        shares = contour[:, 0] / [120, 90]
+        written = np.array([[float(f"{x:g}") for x in corner] for corner in shares]) * [120, 90]  # as YOLO's tools do
+        for corners in (contour[:, 0].astype(float), written):
+            again |= (one := fill_polygon(corners, 120, 90))
+            np.testing.assert_array_equal(one, fill_polygon(corners[::-1], 120, 90))
+    np.testing.assert_array_equal(again, mask)
+
+
+def test_a_polygon_along_pixel_borders_is_no_contour_of_a_mask():
+    heights = np.random.default_rng(0).integers(1, 20, 30)
+    x = np.repeat(np.arange(31), 2)
+    corners = np.stack([x, [0, *np.repeat(heights, 2), 0]], axis=1).astype(float)
+    expected = np.pad(np.arange(20)[:, None] < heights, [(0, 5), (0, 5)])
+    np.testing.assert_array_equal(fill_polygon(corners, 35, 25), expected)
 
 
 @pytest.mark.parametrize("shape", [(7, 5), (1, 1), (1, 300), (300, 1), (200, 180)])
