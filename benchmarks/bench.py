@@ -199,15 +199,20 @@ def mean(values: list[float | None]) -> float | None:
 
 def machine() -> dict[str, Any]:
     """What timings depend on; no names."""
-    commit = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=HERE, capture_output=True, text=True)
+    # A run that goes on where it was finds the document of the first changed.
+    changed = _git("status", "--porcelain", "--untracked-files=no", "--", ":/", ":/!docs")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
-        "commit": commit.stdout.strip(),
+        "commit": _git("rev-parse", "--short", "HEAD") + ("-dirty" if changed else ""),
         "cores": cores,
         "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS"),
         "python": platform.python_version(),
         "architecture": platform.machine(),
     }
+
+
+def _git(*arguments: str) -> str:
+    return subprocess.run(["git", *arguments], cwd=HERE, capture_output=True, text=True).stdout.strip()
 
 
 if __name__ == "__main__":
