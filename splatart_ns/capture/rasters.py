@@ -19,10 +19,13 @@ def fill_polygon(image: np.ndarray, corners: np.ndarray, value: int) -> None:
     polygons that share an edge share no pixel and leave none between them, and one that runs along pixel borders is
     exact. (OpenCV's fillPoly also takes the pixels that an edge touches.)
 
-    But a contour of a mask by OpenCV's findContours, which annotation tools write down as a polygon, runs through the
-    centres of the outermost pixels and counts from the first pixel's: what it runs through is its mask's, too.
+    But contours of masks, which tools write down as polygons, count from the first pixel's centre. OpenCV's
+    findContours runs through the outermost pixels: what it runs through is its mask's, too. scikit-image's
+    find_contours runs midway between them and their neighbours.
     """
-    if _is_traced(corners, *image.shape):
+    if _is_midway(corners):
+        corners = corners + 0.5
+    elif _is_traced(corners, *image.shape):
         image[cv2.fillPoly(np.zeros(image.shape, np.uint8), [np.rint(corners).astype(np.int32)], 1) > 0] = value
         return
     # The first pixels whose centre is not before a corner, all in a window of the image around the polygon.
@@ -61,6 +64,16 @@ def _is_traced(corners: np.ndarray, height: int, width: int) -> bool:
         and pixels.min() >= 0
         and (pixels < [width, height]).all()
     )
+
+
+def _is_midway(corners: np.ndarray) -> bool:
+    """Whether every corner lies midway between two pixels of a row or a column, as those of scikit-image's contours do.
+
+    pycococreator moves corners beyond the image's edge to 0.
+    """
+    halves = np.mod(corners * 2, 2)
+    midway = (halves == [0, 1]).all(axis=1) | (halves == [1, 0]).all(axis=1)
+    return len(corners) >= _TRACED_CORNERS and (midway | (corners == 0).any(axis=1)).all()
 
 
 def decode_runs(counts: Sequence[int], width: int, height: int) -> np.ndarray:

@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 import pytest
 from pycocotools import mask as coco
+from skimage.measure import approximate_polygon, find_contours
 
 from splatart_ns.capture import rasters
 from splatart_ns.capture.rasters import decode_runs, decompress_runs
@@ -26,7 +27,8 @@ def test_a_polygon_agrees_with_the_centres_tested_one_by_one():
     y, x = np.mgrid[:40, :50] + 0.5
     beyond = np.array([[2, 0], [8, 0], [10, 2], [50, 2], [50, 36], [46, 40], [2, 40], [0, 38], [0, 2]], float)
     drawn = [rng.uniform(-20, 70, (n, 2)) for n in (3, 5, 9, 600)]
-    for corners in (*drawn, rng.integers(0, 40, (9, 2)).astype(float), beyond, beyond - 2):
+    drawn += [rng.integers(0, 40, (9, 2)).astype(float), rng.integers(0, 80, (9, 2)) / 2]
+    for corners in (*drawn, beyond, beyond - 2):
         crossings = np.zeros((40, 50), int)
         for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -79,6 +81,18 @@ def test_a_contour_of_a_mask_by_opencv_is_the_mask(seed, approximation):
             again |= (one := fill_polygon(corners, 120, 90))
             np.testing.assert_array_equal(one, fill_polygon(corners[::-1], 120, 90))
     np.testing.assert_array_equal(again, mask)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_contour_of_a_mask_by_scikit_image_is_the_mask(seed):
+    mask = blobs(seed)
+    contours = [c[:, ::-1] - 1 for c in find_contours(np.pad(mask, 1).astype(float), 0.5)]
+    assert len(contours) > 1
+    again = sum(fill_polygon(c[:-1].clip(0), 120, 90) for c in contours)
+    np.testing.assert_array_equal(again, mask)
+    again = sum(fill_polygon(approximate_polygon(c, 1.0).clip(0), 120, 90) for c in contours) > 0
+    aside = [np.roll(mask, [y, x], [0, 1]) for y, x in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    assert (again != mask).sum() < min((other != mask).sum() for other in aside)
 
 
 def test_a_polygon_along_pixel_borders_is_no_contour_of_a_mask():
