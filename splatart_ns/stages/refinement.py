@@ -168,7 +168,7 @@ def _outline_covariance(pair: PartPair, T: Tensor, n: int) -> Tensor:
     All these err as their splat does, alike in all views, which their residuals do not show. Where its Gaussians ought
     to be, the views say whose outlines were given: of their own state, they are few, and each errs for itself. How far
     they scatter about what their equations allow is one factor (overdispersion, McCullagh and Nelder 1989, chapter 4),
-    for too few views leave a sandwich without some directions.
+    for too few views leave a sandwich without some directions. The prior is that of `motion_covariance`.
     """
     total = torch.zeros(n, n).to(T)
     to_target = torch.block_diag(*[rigid_of(T)[:3, :3]] * 2, torch.eye(1).to(T))[:n, :n]
@@ -179,9 +179,11 @@ def _outline_covariance(pair: PartPair, T: Tensor, n: int) -> Tensor:
             continue
         own = replace(pair, splats=(splat, splat), views=((), given), centroid=centroid)
         equations = normal_equations(own, torch.eye(4).to(T), n)
-        H_inv = turn @ torch.linalg.inv(equations.H.sum(0) + 1e-9 * torch.eye(n).to(T)) @ turn.T
-        g = equations.g @ turn.T
-        total += H_inv * ((g @ H_inv) * g).sum() / n * len(given) / max(len(given) - 1, 1)
+        H = equations.H.sum(0)
+        eye = torch.eye(n).to(T)
+        scatter = (equations.g @ torch.linalg.inv(H + 1e-9 * eye) * equations.g).sum() / n
+        scatter = scatter * len(given) / max(len(given) - 1, 1)
+        total += turn @ torch.linalg.inv(H / scatter.clamp_min(1e-9) + eye / math.pi**2) @ turn.T
     return total
 
 

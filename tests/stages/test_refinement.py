@@ -114,20 +114,39 @@ def test_a_tiny_part_turns_less_certainly_than_a_large_one():
     assert sigma(0.15) > 2 * sigma(1.0)
 
 
-def test_a_turn_that_no_image_shows_is_uncertain():
-    n = 8
-    rod = Splat(
+def rod_of(n: int, size: float) -> Splat:
+    """Balls in a row along z, of part 2."""
+    return Splat(
         means=torch.tensor([0.0, 0.0, 1.0]) * torch.linspace(-0.5, 0.5, n)[:, None],
         quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
-        log_scales=torch.full((n, 3), math.log(0.1)),
+        log_scales=torch.full((n, 3), math.log(size)),
         opacity_logits=torch.full((n,), 2.0),
         sh=torch.linspace(-1, 1, n)[:, None, None].expand(n, 1, 3),
         part_logits=torch.tensor([-8.0, -8.0, 0.0]).repeat(n, 1),
     )
+
+
+def test_a_turn_that_no_image_shows_is_uncertain():
+    rod = rod_of(8, 0.1)
     pair = part_pair((rod, rod), (photograph(rod), photograph(rod)), 2, num_views=5, pixels=5000)
     sigma = motion_covariance(pair, torch.eye(4)).diagonal().sqrt()
     assert sigma[5] > 1
     assert (sigma[:5] < 0.01).all()
+
+
+def test_a_turn_that_no_outline_shows_is_uncertain_by_half_a_turn():
+    ball = rod_of(1, 0.4)
+    moved = ball.transformed(motion((0, 0, 0), (0.03, 0.0, 0.0)))
+    shown = zip(photograph(ball), photograph(moved), strict=True)
+    views = [given if k % 3 == 0 else own for k, (given, own) in enumerate(shown)]
+
+    def variances(rendered: bool):
+        flagged = [replace(view, outlined_by_splat=rendered and k % 3 > 0) for k, view in enumerate(views)]
+        pair = part_pair((moved, moved), (flagged, flagged), 2, num_views=10, pixels=5000)
+        return motion_covariance(pair, torch.eye(4))[3:, 3:].diagonal()
+
+    added = variances(True) - variances(False)  # by each of the two states
+    assert (added > 1).all() and (added < 2.01 * math.pi**2).all()
 
 
 def test_large_residuals_that_bend_hardly_mislead_the_search():
