@@ -20,13 +20,12 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from splatart_ns.bundle.motion_file import read_motions
-from splatart_ns.capture.capture import Capture
 from splatart_ns.capture.view import View
 from splatart_ns.choices import require_seed
 from splatart_ns.errors import InputError
 from splatart_ns.plugin.gaussians import gauss_params_from_splat
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig, refuse_unread
-from splatart_ns.plugin.semantic_run import find_semantic_runs, read_state
+from splatart_ns.plugin.semantic_run import LabelledState, find_semantic_runs, read_state
 from splatart_ns.plugin.trainer import LaterPipelineConfig
 from splatart_ns.rasterize.render import render
 from splatart_ns.splats.splat import Splat
@@ -39,12 +38,21 @@ from splatart_ns.stages.neighbours import turned_as_neighbours_let
 from splatart_ns.stages.pose import PartPoses, PoseLossWeights, carry, part_extents, pose_loss, unmixed
 from splatart_ns.stages.pose_notes import doubtful_rest, ill_shown, open_turns, turns_alike, unknown_poses
 from splatart_ns.stages.reference import is_sure, reference_states, refine_known_poses, since_state_0
+from splatart_ns.stages.registration import part_points
 from splatart_ns.stages.shared_labels import share_labels
 from splatart_ns.stages.siblings import slid_alike, slide_ways
 from splatart_ns.stages.silhouette import with_rendered_labels
 from splatart_ns.stages.thinning import BUDGET, MAX_VIEWS, ROUNDS, Absences, absences, expendable, veils
 from splatart_ns.stages.visibility import HIDDEN, looked_at
-from splatart_ns.stages.world import anchors, fit_worlds, moved_splat, moved_views, world_record, world_sentence
+from splatart_ns.stages.world import (
+    anchors,
+    fit_worlds,
+    moved_splat,
+    moved_views,
+    resting_part,
+    world_record,
+    world_sentence,
+)
 
 THINNING_PARTS = 25
 """Into so many parts the steps on merged Gaussians fall; each of the first few begins with a round of thinning."""
@@ -199,28 +207,46 @@ class PosePipeline(VanillaPipeline):
         what = (self.model.num_parts, device, self.datamanager.train_dataset.downscale)
         states = [read_state(capture, s, run, *what) for s, run in enumerate(runs)]
         self._cameras_refined = any(state.cameras_refined for state in states)
+        self._begin(states, next((p for p, name in capture.parts.items() if name == config.root), None))
+
+    def _begin(self, states: Sequence[LabelledState], root: int | None) -> None:
+        """Bring the states into one world, by `root` if they have worlds of their own, and find the first poses."""
+        capture = self.datamanager.capture
+        self.notes, self.findings = [], {}
         splats, views = [state.splat for state in states], [state.views for state in states]
-        self.model.worlds = torch.from_numpy(np.stack([state.placement for state in capture.states])).to(device)
+        self.model.worlds = torch.from_numpy(np.stack([s.placement for s in capture.states])).to(self.model.worlds)
         if capture.worlds != "shared":
-            splats, views = self._brought_together(splats, views, capture)
+            splats, views, anchor = self._brought_together(splats, views, root)
+        around = [splat.select(splat.part_ids == 0) for splat in splats]
         splats, self.views, self._seen, self._clear = seen_of_parts(share_labels(splats, views), views)
         self._shown = [image_error(splat, views) for splat, views in zip(splats, self.views, strict=True)]
         S, P = len(splats), self.model.num_parts
         self._reference, self._known, self._frozen = [0] * P, torch.ones(S, P, dtype=torch.bool), torch.zeros(S, P) > 0
         self._maybe_moved = torch.zeros(S, P) > 0
         self._alike: dict[tuple[int, int], InitialMotion] = {}  # by state and part
-        self.model.start(splats, self._initial_poses(splats), self._frozen)
+        M = self._initial_poses(splats)
+        if capture.worlds != "shared" and root is None and self.config.init == "registration":
+            points = part_points(splats[0], self._seen[0], anchor)
+            parts = sorted(anchors(splats, self._seen, P), key=lambda p: p != anchor)
+            if (rests := resting_part(around, M, self._known, points, parts)) is not None:
+                names = capture.parts
+                CONSOLE.log(f"What surrounds the object rests with {names[rests]}, not {names[anchor]}.", markup=False)
+                self._begin(states, rests)
+                return
+        self.model.start(splats, M, self._frozen)
         # Gaussians learn labels that somebody gave: by those that they showed themselves, images come out worse.
         self._pairs = self._shuffled_pairs(views)
         self._own = self._shuffled_views(views)
 
     def _brought_together(
-        self, splats: list[Splat], views: list[list[View]], capture: Capture
-    ) -> tuple[list[Splat], list[list[View]]]:
-        """Splats and views of all states in the world of state 0."""
+        self, splats: list[Splat], views: list[list[View]], root: int | None
+    ) -> tuple[list[Splat], list[list[View]], int]:
+        """Splats and views of all states in the world of state 0, and the part that brought them there: `root` if it is
+        named or fits, else one that does."""
+        capture = self.datamanager.capture
         objects, labelled, seen, _ = seen_of_parts(splats, views)
-        root = next((p for p, name in capture.parts.items() if name == self.config.root), None)
-        parts = anchors(objects, seen, self.model.num_parts) if root is None else [root]
+        named = self.config.root is not None
+        parts = [root] if named else sorted(anchors(objects, seen, self.model.num_parts), key=lambda p: p != root)
         around = [splat.select(splat.part_ids == 0) for splat in splats]
         found = fit_worlds(objects, labelled, seen, parts, capture.worlds == "similar", self.config.seed, around)
         if found is None:
@@ -238,7 +264,7 @@ class PosePipeline(VanillaPipeline):
             self._note([world_sentence(told, capture.states[0].name)])
         moved = [moved_splat(splat, fit.T) for splat, fit in zip(splats[1:], fits, strict=True)]
         seen_from = [moved_views(some, fit.T) for some, fit in zip(views[1:], fits, strict=True)]
-        return [splats[0], *moved], [views[0], *seen_from]
+        return [splats[0], *moved], [views[0], *seen_from], part
 
     def _initial_poses(self, splats: list[Splat]) -> Tensor:
         """Poses [S, P, 4, 4] to begin from; keeps in mind the reference states, and what is known and what stays."""

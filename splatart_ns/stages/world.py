@@ -38,7 +38,8 @@ MATCHED = 0.7
 """So many of them are found again; others are shown in one state alone."""
 TELLING = 0.8
 """Of turns that fit alike, one is right after which surroundings are less than this many times as far apart as after
-the others: in a room a fridge's measured 0.46 times and a safe's 0.67, beside rough turns by a right angle."""
+the others: in a room a fridge's measured 0.46 times and a safe's 0.67, beside rough turns by a right angle. Of parts,
+that one rests: by a laptop's base instead of its lid 0.09 times, by a fridge's and a drawer's bodies about half."""
 SWEEP = 15
 """Degrees between turns that are tried first: a bucket's room is nearest over 40."""
 
@@ -211,6 +212,32 @@ def fit_worlds(
         if max(f.ratio for f in best[1]) < SUSPECT:
             break
     return best
+
+
+def resting_part(
+    around: Sequence[Splat], motions: Tensor, known: Tensor, points: PartPoints, parts: Sequence[int]
+) -> int | None:
+    """The part that rests in what surrounds the object, where that is not the anchor, which brought worlds together.
+
+    None where surroundings do not tell.
+
+    Args:
+        around: What surrounds the object in each state, all in the world of state 0.
+        motions: Of each part 1..P since state 0 [S, P, 4, 4], as if the anchor rested.
+        known: Which of these were found [S, P].
+        points: Of the anchor, in state 0.
+        parts: The anchor, then the others, the better ones first: several may rest.
+    """
+
+    def apart(T: Tensor) -> float:
+        """Where a part that moves by T [S, 4, 4] is held instead."""
+        return sum(surroundings_apart((around[0], around[s]), inverse(T[s]), points) for s in range(1, len(around)))
+
+    anchor, *others = parts
+    there = apart(torch.eye(4).to(motions.double()).expand(len(around), 4, 4))
+    held = {p: apart(motions[:, p - 1].double()) for p in others if known[:, p - 1].all()}
+    least = min(held.values(), default=math.inf)
+    return next((p for p, a in held.items() if TELLING * a <= least < TELLING * there), None)
 
 
 def moved_views(views: Sequence[View], T: Tensor) -> list[View]:

@@ -157,6 +157,27 @@ def test_only_in_one_world_is_what_looks_still_held_still(pose_trainer, monkeypa
     assert pipeline._frozen[1].tolist() == [worlds == "shared"] * 2
 
 
+@pytest.mark.parametrize("root", [None, "base"])
+def test_worlds_are_brought_together_by_the_part_that_rests_among_surroundings(pose_trainer, monkeypatch, root):
+    tried = []
+
+    def fit(splats, views, seen, parts, *_):
+        tried.append(list(parts))
+        told = torch.eye(4).double()
+        told[0, 3] = parts[0]
+        return parts[0], [WorldFit(told, torch.zeros(7, 7).double(), 1.0)]
+
+    monkeypatch.setattr("splatart_ns.plugin.pose.fit_worlds", fit)
+    monkeypatch.setattr("splatart_ns.plugin.pose.resting_part", lambda *said: said[-1][1])
+    monkeypatch.setattr("splatart_ns.plugin.dataparser.focus_on_focus", lambda *said: replace(said[0], worlds=said[1]))
+    pipeline = pose_trainer(worlds="rigid", root=root).pipeline
+    assert tried == ([[1]] if root else [[1, 2], [2, 1]])
+    (told,) = pipeline.findings["worlds"]
+    assert told["part"] == ("base" if root else "lid") and len(pipeline.notes) == 1
+    scale = pipeline.datamanager.capture.normalization.scale
+    assert pipeline.model.worlds[1, 0, 3] * scale == pytest.approx(1 if root else 2)
+
+
 def test_a_state_is_brought_to_state_0_from_where_it_was_placed(pose_trainer, monkeypatch):
     placed, brought = (se3_exp(torch.tensor(x).double()) for x in ([1.0, 0, 0, 0, 0, 0.8], [0, 0.5, 0, 0.6, 0, 0]))
 

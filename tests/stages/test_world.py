@@ -10,6 +10,7 @@ from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages import world
 from splatart_ns.stages.initial_motion import initial_motion
+from splatart_ns.stages.registration import part_points
 from splatart_ns.stages.visibility import visibility
 from splatart_ns.stages.world import (
     WorldFit,
@@ -18,11 +19,13 @@ from splatart_ns.stages.world import (
     fit_worlds,
     moved_splat,
     moved_views,
+    resting_part,
     world_record,
     world_sentence,
 )
 
 TURN = motion((10, 0, 40), (0.3, -0.2, 0.1))
+ROOM = Splat.cat([box(0, (1.6, 1.2, 0.1), (0.3, 0.2, -0.6)), box(0, (0.2, 0.2, 0.8), (0.9, 0.6, 0.0))])
 
 
 def apart(scale):
@@ -124,9 +127,8 @@ def test_surroundings_tell_which_of_turns_that_fit_alike_is_right(monkeypatch, s
         return replace(end, cost=next(costs)) if steps == world.FEW else end
 
     monkeypatch.setattr(world, "refine", refined)
-    room = Splat.cat([box(0, (1.6, 1.2, 0.1), (0.3, 0.2, -0.6)), box(0, (0.2, 0.2, 0.8), (0.9, 0.6, 0.0))])
-    elsewhere = moved_splat(room if same_room else room.transformed(motion((0, 0, 0), (9, 9, 9))), T)
-    found = fit_world(splats, views, seen, 1, with_scale=True, around=(room, elsewhere))
+    elsewhere = moved_splat(ROOM if same_room else ROOM.transformed(motion((0, 0, 0), (9, 9, 9))), T)
+    found = fit_world(splats, views, seen, 1, with_scale=True, around=(ROOM, elsewhere))
     right = angle_deg(rigid_of(found.T), rigid_of(inverse_similarity(T))) < 5
     assert right == same_room and found.doubtful != same_room
 
@@ -151,9 +153,36 @@ def test_surroundings_tell_how_a_round_part_is_turned(monkeypatch):
 
     monkeypatch.setattr(world, "refine", refined)
     monkeypatch.setattr(world, "initial_motion", found)
-    room = Splat.cat([box(0, (1.6, 1.2, 0.1), (0.3, 0.2, -0.6)), box(0, (0.2, 0.2, 0.8), (0.9, 0.6, 0.0))])
-    there = fit_world(splats, views, seen, 1, with_scale=True, around=(room, moved_splat(room, T)))
+    there = fit_world(splats, views, seen, 1, with_scale=True, around=(ROOM, moved_splat(ROOM, T)))
     assert angle_deg(rigid_of(there.T), rigid_of(inverse_similarity(T))) < 1 and not there.doubtful
+
+
+def rests(anchor: int, room=(ROOM, ROOM), known=True) -> int | None:
+    """Which of three parts rests, of which the second is turned against the others, seen from the anchor."""
+    splats, views = two_states(TURN)
+    motions = torch.eye(4).double().repeat(2, 3, 1, 1)
+    motions[1, 1:] = torch.stack([TURN, motion((0, 0, 0), (0.02, 0, 0))])  # the third is found less exactly
+    seen_from = motions[1, anchor - 1].inverse()
+    motions[1] = seen_from @ motions[1]
+    points = part_points(splats[0], visibility(splats[0], views[0]), min(anchor, 2))
+    noise = 0.03 * torch.randn(room[1].means.shape, generator=torch.Generator().manual_seed(0))
+    brought = room[0], replace(room[1], means=room[1].means + noise).transformed(seen_from)
+    parts = sorted([3, 1, 2], key=lambda part: part != anchor)
+    return resting_part(brought, motions, torch.tensor([[True] * 3, [known] * 3]), points, parts)
+
+
+def test_the_part_rests_that_surroundings_move_with():
+    assert rests(2) == 3  # the first of two
+    assert rests(1) is None and rests(3) is None
+
+
+def test_surroundings_that_do_not_tell_leave_the_part_at_rest_that_brought_worlds_together():
+    elsewhere = ROOM.transformed(motion((0, 0, 0), (9, 9, 9)))
+    turned = ROOM.transformed(motion((50, 80, 20), (0, 0, 0)))
+    nothing = ROOM.select(torch.zeros(len(ROOM.means), dtype=torch.bool))
+    for other in (elsewhere, turned, nothing):
+        assert rests(2, (ROOM, other)) is None
+    assert rests(2, known=False) is None
 
 
 def test_haze_at_one_edge_makes_no_world_larger(monkeypatch):
