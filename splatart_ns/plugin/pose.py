@@ -23,6 +23,7 @@ from splatart_ns.bundle.motion_file import read_motions
 from splatart_ns.capture.view import View
 from splatart_ns.choices import require_seed
 from splatart_ns.errors import InputError
+from splatart_ns.geometry.se3 import inverse
 from splatart_ns.plugin.gaussians import gauss_params_from_splat
 from splatart_ns.plugin.model import SplatartModel, SplatartModelConfig, refuse_unread
 from splatart_ns.plugin.semantic_run import LabelledState, find_semantic_runs, read_state
@@ -49,6 +50,7 @@ from splatart_ns.stages.world import (
     fit_worlds,
     moved_splat,
     moved_views,
+    refine_world,
     resting_part,
     world_record,
     world_sentence,
@@ -209,14 +211,21 @@ class PosePipeline(VanillaPipeline):
         self._cameras_refined = any(state.cameras_refined for state in states)
         self._begin(states, next((p for p, name in capture.parts.items() if name == config.root), None))
 
-    def _begin(self, states: Sequence[LabelledState], root: int | None) -> None:
-        """Bring the states into one world, by `root` if they have worlds of their own, and find the first poses."""
+    def _begin(self, states: Sequence[LabelledState], root: int | None, starts: Sequence[Tensor] = ()) -> None:
+        """Bring the states into one world, where they have worlds of their own, and find the first poses.
+
+        Args:
+            root: The part that brings worlds together, where it is known.
+            starts: Similarities [4, 4] near those by which it does, of all states but state 0; else they are sought.
+        """
         capture = self.datamanager.capture
         self.notes, self.findings = [], {}
         splats, views = [state.splat for state in states], [state.views for state in states]
         self.model.worlds = torch.from_numpy(np.stack([s.placement for s in capture.states])).to(self.model.worlds)
         if capture.worlds != "shared":
-            splats, views, anchor = self._brought_together(splats, views, root)
+            part, worlds = self._worlds(splats, views, root, starts)
+            splats = [splats[0], *map(moved_splat, splats[1:], worlds)]
+            views = [views[0], *map(moved_views, views[1:], worlds)]
         around = [splat.select(splat.part_ids == 0) for splat in splats]
         splats, self.views, self._seen, self._clear = seen_of_parts(share_labels(splats, views), views)
         self._shown = [image_error(splat, views) for splat, views in zip(splats, self.views, strict=True)]
@@ -226,35 +235,40 @@ class PosePipeline(VanillaPipeline):
         self._alike: dict[tuple[int, int], InitialMotion] = {}  # by state and part
         M = self._initial_poses(splats)
         if capture.worlds != "shared" and root is None and self.config.init == "registration":
-            points = part_points(splats[0], self._seen[0], anchor)
-            parts = sorted(anchors(splats, self._seen, P), key=lambda p: p != anchor)
+            points = part_points(splats[0], self._seen[0], part)
+            parts = sorted(anchors(splats, self._seen, P), key=lambda p: p != part)
             if (rests := resting_part(around, M, self._known, points, parts)) is not None:
                 names = capture.parts
-                CONSOLE.log(f"What surrounds the object rests with {names[rests]}, not {names[anchor]}.", markup=False)
-                self._begin(states, rests)
+                CONSOLE.log(f"What surrounds the object rests with {names[rests]}, not {names[part]}.", markup=False)
+                held = M[1:, rests - 1].to(worlds[0])
+                self._begin(states, rests, [inverse(T) @ world for T, world in zip(held, worlds, strict=True)])
                 return
         self.model.start(splats, M, self._frozen)
         # Gaussians learn labels that somebody gave: by those that they showed themselves, images come out worse.
         self._pairs = self._shuffled_pairs(views)
         self._own = self._shuffled_views(views)
 
-    def _brought_together(
-        self, splats: list[Splat], views: list[list[View]], root: int | None
-    ) -> tuple[list[Splat], list[list[View]], int]:
-        """Splats and views of all states in the world of state 0, and the part that brought them there: `root` if it is
-        named or fits, else one that does."""
+    def _worlds(
+        self, splats: list[Splat], views: list[list[View]], root: int | None, starts: Sequence[Tensor]
+    ) -> tuple[int, list[Tensor]]:
+        """The part that brings worlds together, and the similarity [4, 4] of every state but state 0 to its world."""
         capture = self.datamanager.capture
+        with_scale = capture.worlds == "similar"
         objects, labelled, seen, _ = seen_of_parts(splats, views)
-        named = self.config.root is not None
-        parts = [root] if named else sorted(anchors(objects, seen, self.model.num_parts), key=lambda p: p != root)
-        around = [splat.select(splat.part_ids == 0) for splat in splats]
-        found = fit_worlds(objects, labelled, seen, parts, capture.worlds == "similar", self.config.seed, around)
-        if found is None:
-            raise InputError(
-                f"{capture.path}: no part is seen well enough in all states to bring their worlds together; label "
-                "a part in more frames of every state, or name one by --root."
-            )
-        part, fits = found
+        if starts:
+            pairs = [((objects[0], objects[k]), (labelled[0], labelled[k])) for k in range(1, len(objects))]
+            part = root
+            fits = [refine_world(*pair, root, T, with_scale) for pair, T in zip(pairs, starts, strict=True)]
+        else:
+            parts = anchors(objects, seen, self.model.num_parts) if root is None else [root]
+            around = [splat.select(splat.part_ids == 0) for splat in splats]
+            found = fit_worlds(objects, labelled, seen, parts, with_scale, self.config.seed, around)
+            if found is None:
+                raise InputError(
+                    f"{capture.path}: no part is seen well enough in all states to bring their worlds together; label "
+                    "a part in more frames of every state, or name one by --root."
+                )
+            part, fits = found
         self.findings["worlds"] = []
         for k, fit in enumerate(fits, start=1):
             to_first = torch.from_numpy(capture.normalization.motion_to_world(fit.T.numpy(force=True)))
@@ -262,9 +276,7 @@ class PosePipeline(VanillaPipeline):
             told = world_record(capture.states[k].name, self.model.part_names[part], self.model.worlds[k], fit)
             self.findings["worlds"].append(told)
             self._note([world_sentence(told, capture.states[0].name)])
-        moved = [moved_splat(splat, fit.T) for splat, fit in zip(splats[1:], fits, strict=True)]
-        seen_from = [moved_views(some, fit.T) for some, fit in zip(views[1:], fits, strict=True)]
-        return [splats[0], *moved], [views[0], *seen_from], part
+        return part, [fit.T for fit in fits]
 
     def _initial_poses(self, splats: list[Splat]) -> Tensor:
         """Poses [S, P, 4, 4] to begin from; keeps in mind the reference states, and what is known and what stays."""

@@ -111,7 +111,7 @@ def fit_world(
             others = [a for a, r in zip(apart, rivals, strict=True) if _quite_other(r, rivals[best])]
             if max(apart) < math.inf and apart[best] < TELLING * min(others, default=0.0):
                 T, doubtful = rivals[best], False
-    fit = _refined(splats, views, part, inverse_similarity(T) @ zoom.to(T), with_scale)
+    fit = refine_world(splats, views, part, inverse_similarity(T) @ zoom.to(T), with_scale)
     return replace(fit, doubtful=doubtful)
 
 
@@ -157,14 +157,14 @@ def surroundings_apart(around: tuple[Splat, Splat], T: Tensor, part: PartPoints)
     return float(distance[: round(MATCHED * len(distance))].mean() / part.radius)
 
 
-def _refined(
+def refine_world(
     splats: tuple[Splat, Splat],
     views: tuple[Sequence[View], Sequence[View]],
     part: int,
     world: Tensor,
     with_scale: bool,
 ) -> WorldFit:
-    """`fit_world` from a similarity near the best."""
+    """`fit_world` from a similarity near the best, which brings the other state's world to that of state 0."""
     eye = torch.eye(4).to(world)
     flush = any(is_flush(some, part) for some in views)
     for without in (False,) if flush else (False, True):

@@ -11,7 +11,7 @@ from nerfstudio.engine.trainer import Trainer
 from splatart_ns.capture.check import require_valid
 from splatart_ns.capture.formats import load_capture
 from splatart_ns.errors import InputError
-from splatart_ns.geometry.se3 import se3_exp, so3_log, transform_points
+from splatart_ns.geometry.se3 import inverse, se3_exp, so3_log, transform_points
 from splatart_ns.method_configs.pose import method as pose_method
 from splatart_ns.plugin.pose import MOST, RATES, THINNING_PARTS
 from splatart_ns.plugin.semantic_run import read_state
@@ -159,23 +159,33 @@ def test_only_in_one_world_is_what_looks_still_held_still(pose_trainer, monkeypa
 
 @pytest.mark.parametrize("root", [None, "base"])
 def test_worlds_are_brought_together_by_the_part_that_rests_among_surroundings(pose_trainer, monkeypatch, root):
-    tried = []
+    world, moved = (se3_exp(torch.tensor(x).double()) for x in ([1.0, 0, 0, 0, 0, 0.8], [0, 0.5, 0, 0.6, 0, 0]))
+    tried, asked = [], []
 
     def fit(splats, views, seen, parts, *_):
         tried.append(list(parts))
-        told = torch.eye(4).double()
-        told[0, 3] = parts[0]
-        return parts[0], [WorldFit(told, torch.zeros(7, 7).double(), 1.0)]
+        return 1, [WorldFit(world, torch.zeros(7, 7).double(), 1.0)]
+
+    def refine(splats, views, part, start, with_scale):
+        tried.append(part)
+        return WorldFit(start, torch.zeros(7, 7).double(), 1.0)
+
+    def rests(around, motions, known, points, parts):
+        asked.append(list(parts))
+        return 2
 
     monkeypatch.setattr("splatart_ns.plugin.pose.fit_worlds", fit)
-    monkeypatch.setattr("splatart_ns.plugin.pose.resting_part", lambda *said: said[-1][1])
+    monkeypatch.setattr("splatart_ns.plugin.pose.refine_world", refine)
+    monkeypatch.setattr("splatart_ns.plugin.pose.resting_part", rests)
+    monkeypatch.setattr("splatart_ns.plugin.pose.initial_motion", lambda *_: InitialMotion(moved, found=True))
     monkeypatch.setattr("splatart_ns.plugin.dataparser.focus_on_focus", lambda *said: replace(said[0], worlds=said[1]))
     pipeline = pose_trainer(worlds="rigid", root=root).pipeline
-    assert tried == ([[1]] if root else [[1, 2], [2, 1]])
+    assert (tried, asked) == (([[1]], []) if root else ([[1, 2], 2], [[1, 2]]))
     (told,) = pipeline.findings["worlds"]
     assert told["part"] == ("base" if root else "lid") and len(pipeline.notes) == 1
-    scale = pipeline.datamanager.capture.normalization.scale
-    assert pipeline.model.worlds[1, 0, 3] * scale == pytest.approx(1 if root else 2)
+    there = world if root else inverse(moved) @ world
+    expected = pipeline.datamanager.capture.normalization.motion_to_world(there.numpy())
+    assert torch.allclose(pipeline.model.worlds[1], torch.from_numpy(expected))
 
 
 def test_a_state_is_brought_to_state_0_from_where_it_was_placed(pose_trainer, monkeypatch):
