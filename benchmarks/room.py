@@ -65,12 +65,14 @@ class Options:
     """Folder for captures and bundles."""
     objects: tuple[str, ...] = ("drawer", "hinge")
     """Built-in objects, or URDF files, whose joint values are drawn as `splatart synth` does."""
+    states: int = 2
+    """How many states of a URDF file; built-in objects have two."""
     frames: int = 60
     """Frames of each state; every 8th is a test frame, as `splatart` chooses them."""
     labelled: int = 10
     """How many of them are labelled."""
     worlds: bool = False
-    """Give the second state a world of its own: any rotation, a scale of 0.5 to 2."""
+    """Give each state but the first a world of its own: any rotation, a scale of 0.5 to 2."""
     jitter: float = 0.0
     """How many degrees, and percent of their distance, cameras are off (see spoil.py)."""
     exposure: float = 0.0
@@ -104,15 +106,15 @@ def main(options: Options) -> None:
 
 
 def write_room(name: str, folder: Path, options: Options) -> None:
-    """`phone_0`, `phone_1`: what a phone and ns-process-data leave. `truth`: a capture with all labels, silhouettes and
-    ground_truth.json."""
+    """`phone_0`, `phone_1`, ...: what a phone and ns-process-data leave. `truth`: a capture with all labels,
+    silhouettes and ground_truth.json."""
     with tempfile.TemporaryDirectory() as temporary:
         robot = read_urdf(build_object(name).write(Path(temporary)) if name in OBJECTS else Path(name))
         surfaces = part_surfaces(robot, {})
     if name in OBJECTS:
         configurations = [robot.complete(values) for values in OBJECTS[name]]
     else:
-        configurations = draw_configurations(robot, {}, surfaces, 2, options.seed)
+        configurations = draw_configurations(robot, {}, surfaces, options.states, options.seed)
     scene = Scene.of(robot, {}, surfaces, configurations)
     for k in range(len(configurations)):
         _write_state(folder, scene, k, options)
