@@ -18,13 +18,13 @@ from splatart_ns.geometry.similarity import inverse_similarity, rigid_of, scale_
 from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.flush import is_flush
 from splatart_ns.stages.free_space import FreeSpace, without_haze
-from splatart_ns.stages.initial_motion import initial_motion
+from splatart_ns.stages.initial_motion import WIDE_VIEWS, initial_motion
 from splatart_ns.stages.motion_preference import OTHERWISE, SUSPECT
 from splatart_ns.stages.part_pair import IN_EVEN_LIGHT, part_pair
 from splatart_ns.stages.pose_evidence import ALL_VIEWS, MAX_ITERATIONS
 from splatart_ns.stages.refinement import motion_covariance, refine
-from splatart_ns.stages.registration import COLOUR, MIN_POINTS, PartPoints, part_points
-from splatart_ns.stages.render_choice import COARSE_PIXELS, DOUBTFUL_VIEWS, FINE_PIXELS, VIEWS
+from splatart_ns.stages.registration import COLOUR, MIN_POINTS, PartPoints, part_points, register
+from splatart_ns.stages.render_choice import COARSE_PIXELS, DOUBTFUL_VIEWS, FINE_PIXELS, TINY_PIXELS, VIEWS, choose
 from splatart_ns.stages.visibility import shown_of_parts
 
 ALIKE = 1.05
@@ -32,6 +32,9 @@ ALIKE = 1.05
 alike fitted 1.11 to 1.14 times worse than the right one, after it was refined."""
 FEW = 10
 """Steps that tell which fits best."""
+SIZED, SIZINGS = 0.02, 3
+"""The logarithm of how much larger a part may be in one of two states when it is registered, and so many tries at most
+to come there: by its radii a pot, whose inside one state hides, was 20 % off, and after them 0.3 %."""
 AROUND, SOLID, ENOUGH = 4.0, 0.3, 100
 """Surroundings are so many Gaussians at least, of such an opacity, within so many radii of the part."""
 MATCHED = 0.7
@@ -70,7 +73,7 @@ def fit_world(
 ) -> WorldFit | None:
     """The similarity, or the rigid motion, of another state's world to that of state 0 under which `part` rests.
 
-    Many-start registration chosen by rendering, after the part is given the radius that it has in state 0, and then
+    Many-start registration chosen by rendering, after the part is given the size that it has in state 0, and then
     Gauss-Newton on images for all seven unknowns: on few pixels, on more where it looks alike after other motions, to
     choose among these, on many and, unless the part lies flush with others, once more without haze (see `free_space`),
     which made a pair of scissors .1 % too small. None where the images show too little of the part.
@@ -85,7 +88,7 @@ def fit_world(
     points = [part_points(s, v, part) for s, v in zip(splats, seen, strict=True)]
     if min(len(p.xyz) for p in points) < MIN_POINTS:
         return None
-    factor = points[0].radius / points[1].radius if with_scale else 1.0
+    factor = _factor(splats, views, seen, part, seed) if with_scale else 1.0
     zoom = similarity(factor, torch.eye(3), torch.zeros(3))
     zoomed = splats[0], splats[1].scaled(factor)
     zoomed_views = views[0], moved_views(views[1], zoom)
@@ -113,6 +116,36 @@ def fit_world(
                 T, doubtful = rivals[best], False
     fit = refine_world(splats, views, part, inverse_similarity(T) @ zoom.to(T), with_scale)
     return replace(fit, doubtful=doubtful)
+
+
+def _factor(
+    splats: tuple[Splat, Splat],
+    views: tuple[Sequence[View], Sequence[View]],
+    seen: tuple[Tensor, Tensor],
+    part: int,
+    seed: int,
+) -> float:
+    """How many times larger the other state's world is made so that a part has about the size that it has in state 0.
+
+    That is told by its radius in both states, and, as they may show different sides of it, by images of few pixels, in
+    which motions that registration proposes are refined with their scale.
+    """
+    source, target = (part_points(s, v, part) for s, v in zip(splats, seen, strict=True))
+    factor = source.radius / target.radius
+    for _ in range(SIZINGS):
+        zoomed = splats[0], splats[1].scaled(factor)
+        zoom = similarity(factor, torch.eye(3), torch.zeros(3))
+        pair = part_pair(zoomed, (views[0], moved_views(views[1], zoom)), part, WIDE_VIEWS, TINY_PIXELS)
+        if pair is None:
+            return factor
+        proposed = register(source, part_points(zoomed[1], seen[1], part), seed)
+        near = choose(pair, torch.from_numpy(proposed).to(pair.centroid), math.inf)
+        best = min((refine(pair, T, MAX_ITERATIONS, with_scale=True) for T in near), key=lambda end: end.cost)
+        scale = float(scale_of(best.T))
+        factor /= scale
+        if abs(math.log(scale)) < SIZED:
+            break
+    return factor
 
 
 def _quite_other(a: Tensor, b: Tensor) -> bool:

@@ -58,6 +58,26 @@ def test_a_resting_part_brings_worlds_together(scale, with_scale):
     assert torch.allclose(transform_points(found.T, corners), transform_points(there, corners), atol=3e-3)
 
 
+def test_a_part_has_its_size_when_it_is_registered_though_its_radii_mislead(monkeypatch):
+    splats, views, T = apart(1.6)
+    seen = [visibility(s, v) for s, v in zip(splats, views, strict=True)]
+    back = transform_points(inverse_similarity(T), splats[1].means.double())
+    seen[1] = torch.where((splats[1].part_ids == 1) & (back[:, 0] > 0.1), 0.0, seen[1])  # as if another part hid it
+    radii = [part_points(s, v, 1).radius for s, v in zip(splats, seen, strict=True)]
+    assert abs(math.log(1.6 * radii[0] / radii[1])) > 0.15
+    sizes = []
+
+    def found(zoomed, *arguments):
+        sizes.append(float(zoomed[1].scales.mean() / splats[0].scales.mean()))
+        return initial_motion(zoomed, *arguments)
+
+    monkeypatch.setattr(world, "initial_motion", found)
+    found = fit_world(splats, views, seen, 1, with_scale=True)
+    assert sizes == [pytest.approx(1, abs=world.SIZED)]
+    assert float(scale_of(found.T @ T)) == pytest.approx(1, abs=2e-3)
+    assert angle_deg(rigid_of(found.T), rigid_of(inverse_similarity(T))) < 0.5
+
+
 @pytest.mark.parametrize(("with_scale", "words"), [(False, "let its scale be found (--worlds similar)"), (True, None)])
 def test_a_world_of_another_scale_is_to_be_brought_together_with_its_scale(with_scale, words):
     splats, views, _ = apart(2.5)
