@@ -19,7 +19,7 @@ from splatart_ns.splats.splat import Splat
 from splatart_ns.stages.flush import is_flush
 from splatart_ns.stages.free_space import FreeSpace, without_haze
 from splatart_ns.stages.initial_motion import WIDE_VIEWS, initial_motion
-from splatart_ns.stages.motion_preference import OTHERWISE, SUSPECT
+from splatart_ns.stages.motion_preference import AS_WELL, OTHERWISE, SUSPECT
 from splatart_ns.stages.part_pair import IN_EVEN_LIGHT, part_pair
 from splatart_ns.stages.pose_evidence import ALL_VIEWS, MAX_ITERATIONS
 from splatart_ns.stages.refinement import motion_covariance, refine
@@ -34,7 +34,7 @@ FEW = 10
 """Steps that tell which fits best."""
 SIZED, SIZINGS = 0.02, 3
 """The logarithm of how much larger a part may be in one of two states when it is registered, and so many tries at most
-to come there: by its radii a pot, whose inside one state hides, was 20 % off, and after them 0.3 %."""
+to come there: by its radii a pot, whose inside one state hides, was 20 % off, and 1.7 % after one."""
 AROUND, SOLID, ENOUGH = 4.0, 0.3, 100
 """Surroundings are so many Gaussians at least, of such an opacity, within so many radii of the part."""
 MATCHED = 0.7
@@ -139,11 +139,11 @@ def _factor(
         if pair is None:
             return factor
         proposed = register(source, part_points(zoomed[1], seen[1], part), seed)
-        near = choose(pair, torch.from_numpy(proposed).to(pair.centroid), math.inf)
+        near = choose(pair, torch.from_numpy(proposed).to(pair.centroid), math.inf, keep=1)
         best = min((refine(pair, T, MAX_ITERATIONS, with_scale=True) for T in near), key=lambda end: end.cost)
         scale = float(scale_of(best.T))
         factor /= scale
-        if abs(math.log(scale)) < SIZED:
+        if abs(math.log(scale)) < SIZED or best.cost < AS_WELL * pair.own_cost():
             break
     return factor
 
