@@ -22,7 +22,7 @@ from splatart_ns.errors import InputError
 from splatart_ns.machine import num_cores
 from splatart_ns.plugin.dataparser import SplatartDataParserConfig
 from splatart_ns.stages.exposure import at_gain
-from splatart_ns.stages.hull import EXACT, SeedPoints, seed_points, seen_surface, slack, visual_hull
+from splatart_ns.stages.hull import EXACT, Hull, SeedPoints, seed_points, seen_surface, slack, visual_hull
 from splatart_ns.stages.silhouette import with_silhouette
 from splatart_ns.stages.surroundings import surrounding_points
 
@@ -118,6 +118,8 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         """How many times brighter than their mean the training frames are, by channel [N, 3]: they come evened."""
         self.voxel = 0.0
         """Side of a voxel of the silhouettes' hull."""
+        self.outlined: Hull | None = None
+        """That of the frames with an outline, where others have none: the object may be there."""
         if config.seed_gaussians > 0 and test_mode == "val":  # otherwise a checkpoint brings the Gaussians
             self._add_seed_points()
 
@@ -146,7 +148,7 @@ class SplatartDatamanager(FullImageDatamanager[CaptureDataset]):
         if any(view.alpha is None for view in views):
             outlined = [v for view in views if (v := with_silhouette(view)) is not None]
             around = surrounding_points(views, count, generator) if points is None else points.drawn(count, generator)
-            hull = visual_hull(outlined) if outlined else None
+            hull = self.outlined = visual_hull(outlined) if outlined else None
             if hull is None:
                 self._require_agreement(state)
             else:

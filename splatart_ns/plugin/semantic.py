@@ -329,7 +329,8 @@ class SemanticPipeline(VanillaPipeline):
         due = [p for p in PASSES if step == round(p.at * self.model.config.semantic_start)]
         if not due or not self._refines:
             return
-        found = refine_cameras(self.model.splat.detach(), self._views, self._given, due[-1].pixels)
+        splat, pixels = self.model.splat.detach(), due[-1].pixels
+        found = refine_cameras(splat, self._views, self._given, pixels, self.datamanager.outlined)
         if self._tries and due[-1] is TRIED and image_shift(found, self._given, self._views) < EXACT_PIXELS:
             self._refines = False
             found = self._given.to(found)

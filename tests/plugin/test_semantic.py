@@ -325,7 +325,8 @@ def test_cameras_of_images_without_silhouettes_move_if_that_is_by_pixels(
     given = pipeline.model.viewmats.clone()
     assert pipeline.datamanager.cached_train  # is loaded, and the cameras with it
 
-    def shifted(splat, views, given, compared):
+    def shifted(splat, views, given, compared, hull):
+        assert len(hull[0]) > 0  # the labelled frames say where the object may be
         found = given.clone()
         found[:, 0, 3] += pixels * given[:, 2, 3] / torch.stack([view.K[0, 0] for view in views])
         return found

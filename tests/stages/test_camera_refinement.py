@@ -55,6 +55,29 @@ def test_cameras_come_nearer_to_the_truth(name, request):
     assert after < 0.5 * before
 
 
+def test_cameras_go_by_surroundings_where_the_object_is_not_yet_as_it_is(scene):
+    walls = box(0, (12.0, 12.0, 12.0), (0.0, 0.0, 0.0), spacing=0.5)
+    walls.sh = 2 * torch.rand(walls.sh.shape, generator=torch.Generator().manual_seed(0)) - 1
+    views = [replace(view, alpha=None) for view in photograph(Splat.cat([scene[0], walls]))]
+    thin = Splat.cat([replace(scene[0], means=scene[0].means * torch.tensor([1.0, 0.85, 1.0])), walls])
+    given, shifts = viewmats(views), []
+    for hull in (None, (scene[0].means, 0.02)):
+        found = views
+        for _ in PASSES:
+            refined = refine_cameras(thin, found, given, 5000, hull)
+            found = [replace(v, viewmat=m.float()) for v, m in zip(found, refined, strict=True)]
+        shifts.append(image_shift(refined, given, views))
+    assert shifts[1] < 0.1 and shifts[1] < 0.4 * shifts[0]
+
+
+def test_an_object_that_fills_images_counts_as_if_nothing_were_known_of_it(scene):
+    splat, views = scene[0], [replace(view, alpha=None) for view in scene[1]]
+    wrong = jittered(views, 0.01)
+    everywhere = torch.cartesian_prod(*3 * [torch.linspace(-3, 3, 60)]), 0.1
+    refined = [refine_cameras(splat, wrong, viewmats(wrong), 500, hull) for hull in (None, everywhere)]
+    assert torch.allclose(*refined, atol=1e-6)
+
+
 def seen_shift(splat, found, true):
     """Root mean square distance of points in the cameras' frames from where they should be, less what all share."""
     points = torch.cat([splat.means.double(), torch.ones(len(splat), 1)], 1)
