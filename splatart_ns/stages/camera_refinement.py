@@ -24,11 +24,10 @@ CORRELATED_SHIFT, CORRELATED_REST = 100.0, 1000.0
 """The image counts as so many times fewer pixels, which err together: of where in it the object lies, and of how the
 camera is tilted, rolled and how near it is. All pixels tell the first; what they tell of the rest is small, and a splat
 that wrong cameras have blurred misleads it."""
-
 OBJECT_WEIGHT = 0.1
-"""That of pixels which may show the object, against those of its surroundings: the hull of a few outlines puts the
-sides of a flat window too near to each other or too far apart, and cameras that follow them are wrong by 1.7 pixels;
-0.5 with this weight, 0.3 without the object, of 1.1. Of a suitcase and a toaster it makes no difference."""
+"""That of pixels which may show the object, against those of its surroundings: cameras that were 1.1 pixels off, and
+followed the two sides of a flat window, which show in no view together, came to be 1.7 off; with this weight 0.5,
+without the object 0.3. A toaster's came to 0.45 pixels instead of 0.39."""
 
 
 @dataclass(frozen=True)

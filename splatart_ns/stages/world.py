@@ -34,7 +34,7 @@ FEW = 10
 """Steps that tell which fits best."""
 SIZED, SIZINGS = 0.02, 3
 """The logarithm of how much larger a part may be in one of two states when it is registered, and so many tries at most
-to come there: by its radii a pot, whose inside one state hides, was 20 % off, and 1.7 % after one."""
+to come there: by its radii in two states a pot was 20 % off, and 1.7 % after one."""
 AROUND, SOLID, ENOUGH = 4.0, 0.3, 100
 """Surroundings are so many Gaussians at least, of such an opacity, within so many radii of the part."""
 MATCHED = 0.7
@@ -88,10 +88,8 @@ def fit_world(
     points = [part_points(s, v, part) for s, v in zip(splats, seen, strict=True)]
     if min(len(p.xyz) for p in points) < MIN_POINTS:
         return None
-    factor = _factor(splats, views, seen, part, seed) if with_scale else 1.0
-    zoom = similarity(factor, torch.eye(3), torch.zeros(3))
-    zoomed = splats[0], splats[1].scaled(factor)
-    zoomed_views = views[0], moved_views(views[1], zoom)
+    factor = _factor(splats, views, points, part, seed) if with_scale else 1.0
+    zoom, zoomed, zoomed_views = _zoomed(splats, views, factor)
     start = initial_motion(zoomed, zoomed_views, seen, part, seed)
     coarse = part_pair(zoomed, zoomed_views, part, VIEWS, COARSE_PIXELS)
     if not start.found or coarse is None:
@@ -121,7 +119,7 @@ def fit_world(
 def _factor(
     splats: tuple[Splat, Splat],
     views: tuple[Sequence[View], Sequence[View]],
-    seen: tuple[Tensor, Tensor],
+    points: Sequence[PartPoints],
     part: int,
     seed: int,
 ) -> float:
@@ -130,15 +128,13 @@ def _factor(
     That is told by its radius in both states, and, as they may show different sides of it, by images of few pixels, in
     which motions that registration proposes are refined with their scale.
     """
-    source, target = (part_points(s, v, part) for s, v in zip(splats, seen, strict=True))
+    source, target = points
     factor = source.radius / target.radius
     for _ in range(SIZINGS):
-        zoomed = splats[0], splats[1].scaled(factor)
-        zoom = similarity(factor, torch.eye(3), torch.zeros(3))
-        pair = part_pair(zoomed, (views[0], moved_views(views[1], zoom)), part, WIDE_VIEWS, TINY_PIXELS)
+        pair = part_pair(*_zoomed(splats, views, factor)[1:], part, WIDE_VIEWS, TINY_PIXELS)
         if pair is None:
             return factor
-        proposed = register(source, part_points(zoomed[1], seen[1], part), seed)
+        proposed = register(source, replace(target, xyz=factor * target.xyz), seed)
         near = choose(pair, torch.from_numpy(proposed).to(pair.centroid), math.inf, keep=1)
         best = min((refine(pair, T, MAX_ITERATIONS, with_scale=True) for T in near), key=lambda end: end.cost)
         scale = float(scale_of(best.T))
@@ -146,6 +142,14 @@ def _factor(
         if abs(math.log(scale)) < SIZED or best.cost < AS_WELL * pair.own_cost():
             break
     return factor
+
+
+def _zoomed(
+    splats: tuple[Splat, Splat], views: tuple[Sequence[View], Sequence[View]], factor: float
+) -> tuple[Tensor, tuple[Splat, Splat], tuple[Sequence[View], Sequence[View]]]:
+    """How the other state's world becomes so many times larger [4, 4], and both states with that."""
+    zoom = similarity(factor, torch.eye(3), torch.zeros(3))
+    return zoom, (splats[0], splats[1].scaled(factor)), (views[0], moved_views(views[1], zoom))
 
 
 def _quite_other(a: Tensor, b: Tensor) -> bool:
